@@ -310,8 +310,13 @@ def _parse_set(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
     section, dot, name = key.strip().partition(".")
     if not (equals and dot and section and name):
-        why = "not of the form section.key=value"
-        raise ConfigError(f"--set {text}", why, "for example --set topics.gnss=/gps/fix")
+        why, advice = "not of the form section.key=value", "for example --set topics.gnss=/gps/fix"
+        owners = [
+            f"{one}.{key.strip()}" for one, kind in SECTIONS.items() for two in fields(kind) if two.name == key.strip()
+        ]
+        if owners:
+            why, advice = "the section of the key is missing", f"did you mean {' or '.join(owners)}?"
+        raise ConfigError(f"--set {text}", why, advice)
     if not value.strip():
         raise ConfigError(key.strip(), "its value is empty", "leave the option out for the default")
     found: Any = value.strip()

@@ -66,7 +66,7 @@ BATCH = options.together(
 )
 
 
-@click.command("batch")
+@options.command("batch")
 @click.argument("places", metavar="LOG|FOLDER|MANIFEST...", nargs=-1, required=True, type=LOG)
 @option("-o --output", "DIR", PLACE, "Folder for the tables, or its address; the run directories go to runs/ in it.",
         required=True)  # fmt: skip
@@ -187,6 +187,8 @@ class View(LiveLine):
             for verdict in row.verdicts:
                 if not verdict.passed:
                     click.echo(escaped(verdict.line), err=True)
+                elif row.status != "failed":
+                    self._printer.text(escaped(verdict.line))
             self._show()
 
     def _show(self) -> None:

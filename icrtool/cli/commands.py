@@ -28,6 +28,13 @@ _COMMANDS = {
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",
 }
 
+_GROUPS = {
+    "Start here": ("info", "report", "demo"),
+    "Commands": ("fit", "dropout-report", "calibrate", "forecast", "export", "compare", "batch"),
+    "More": ("robots", "config", "cache", "completion", "simulate", "study"),
+}
+"""The commands as ``--help`` groups them."""
+
 _COMMAND_MODULES = {
     "info": "fit",
     "forecast": "calibrate",
@@ -64,8 +71,10 @@ class _Commands(click.Group):
             raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl(list(_COMMANDS.items()))
+        widest = max(map(len, _COMMANDS))
+        for title, names in _GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(f"{name:{widest}}", _COMMANDS[name]) for name in names])
 
 
 @click.command(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})

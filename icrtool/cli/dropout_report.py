@@ -14,6 +14,7 @@ from icrtool.cli.inputs import RUNS_FOLDER, ResultPlace, RunPlace, check_run_con
 from icrtool.cli.options import FILE, POSITIVE, Exports, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.choices import Reference, Starts
+from icrtool.records.places import UrlPath
 from icrtool.records.text import LogText, escaped
 
 with when_used():
@@ -69,7 +70,7 @@ REPORT_OPTIONS = options.reporting(
 )  # fmt: skip
 
 
-@click.command("dropout-report", epilog=EPILOG_GATE)
+@options.command("dropout-report", epilog=EPILOG_GATE)
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
 @REPORT_OPTIONS
 @options.CONFIGURATION
@@ -100,6 +101,9 @@ def dropout_report_command(
         raise errors.ConfigError("--score", why, "name its LOG in place of the run")
     if report.score and recording_files.STANDARD_INPUT in sources:
         raise errors.ConfigError("--score", "the log is read twice, and standard input is there once", "name a file")
+    if compared is not None and len(places) == len(sources) and any(map(options.names_baseline, report.gates)):
+        robot = config.robot.name or ""
+        compared.check_compares((recording_files.log_name(log), content_of(log), robot, "") for log in sources)
     inputs = Inputs("source")
     reports: dict[str, DropoutReport] = {}
     for number, source in enumerate(sources):
@@ -145,6 +149,13 @@ def plan_sources(
     return sources, {}
 
 
+def content_of(log: Path) -> tuple[str, ...]:
+    """Return the SHA-256 of each file of a log on disk, in which a baseline finds it."""
+    if isinstance(log, UrlPath):
+        return ()
+    return tuple(recording_files.file_sha256(file) for file in recording_files.files_of_log(log) if file.is_file())
+
+
 class Given(NamedTuple):
     """What the reports are given: calibrations, and the reports of an earlier version."""
 
@@ -166,7 +177,10 @@ def report_one(
             run, folder = stack.enter_context(fitted_log(source, place, config, request.fit, files, printer))
         if request.outage_at_s and not dropout_report.forced_lengths_s(run, request):
             raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-        baseline = given.baseline.find(run.name, run.document.content) if given.baseline is not None else None
+        baseline = None
+        if given.baseline is not None:
+            robot = run.document.config.robot.name or ""
+            baseline = given.baseline.find(run.name, run.document.content, robot)
         with printer.stages(LogText(run.name)) as stages:
             report = pipeline.report_into(
                 folder, run, request, files, stages.begin, log=None if place is None else source,

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, cast, get_args
 import click
 
 from icrtool.cli import when_used
-from icrtool.cli.inputs import RUNS_FOLDER, read_calibration
+from icrtool.cli.inputs import RUNS_FOLDER, is_log, read_calibration
 from icrtool.cli.options import FILE, PLACE, choice, flag, option
 from icrtool.cli.printing import Printer, write_or_print
 from icrtool.records.choices import ControllerTarget, TrajectoryFormat
+from icrtool.records.text import escaped
 
 with when_used():
     from icrtool import errors
@@ -111,6 +112,9 @@ def _write_foxglove(run: Run, output: Path) -> None:
 
 def _run(source: Path | None, output: Path | None = None) -> Run:
     """Read the run whose paths are asked for; one that is not usable has them too. Its log is never the output."""
+    if source is not None and is_log(source):
+        advice = f"icrtool fit {escaped(str(source))} makes its run"
+        raise errors.RunError(source, "is a log, and paths come from a run", advice)
     if source is not None and source.is_file():
         advice = "name a directory that icrtool fit wrote"
         raise errors.RunError(source, "is a file, and paths come from a run", advice)

@@ -14,7 +14,7 @@ import click
 from icrtool.cli import options, when_used
 from icrtool.cli.inputs import ResultPlace, RunPlace, logs_of, run_directories
 from icrtool.cli.options import PLACE, choice, flag, option
-from icrtool.cli.printing import Inputs, Printer
+from icrtool.cli.printing import Inputs, Printer, error
 from icrtool.records.choices import StatesFormat
 from icrtool.records.places import UrlPath
 from icrtool.records.text import LogText, escaped
@@ -51,14 +51,15 @@ REQUEST = options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", o
 ))  # fmt: skip
 
 
-@click.command("fit")
+@options.command("fit")
 @options.LOGS
 @REQUEST
+@flag("--strict", "Exit with status 3 where a run must not be used.")
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def fit_command(
     logs: tuple[Path, ...], place: ResultPlace, warm_start: Path | None, request: FitRequest, files: ResultFiles,
-    settings: ConfigSources, printer: Printer,
+    strict: bool, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
@@ -72,18 +73,21 @@ def fit_command(
     """  # noqa: D301 - click reads the escape
     config = settings.load()
     logs = logs_of(logs, printer)
-    inputs = Inputs("log")
+    inputs, all_usable = Inputs("log"), True
     for log, (directory, inside) in zip(logs, run_directories(logs, place), strict=True):
         with inputs.each(log) as document:
             with fitted_log(log, RunPlace(directory, inside), config, request, files, printer, warm_start) as (run, _):
                 pass
+            all_usable = all_usable and run.usable
+            if strict and not (run.usable or printer.shows):
+                error(f"{run.name}: do not use this run: {run.document.unusable_because}")
             where = escaped(str(directory))
             document |= {"directory": where, "run": run.summary}
             # The command that names what is wrong in the log.
             examine = shlex.join(["icrtool", "info", escaped(str(log)), "-v", *options.given(settings, request)])
             printer.show([*run_tables.run_blocks(run.document), *run_tables.next_blocks(run.document, where, examine)])
     printer.json("fit", {"logs": inputs.documents})
-    inputs.leave("logs")
+    inputs.leave("logs", gate_failed=strict and not all_usable)
 
 
 @contextmanager

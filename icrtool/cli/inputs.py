@@ -19,6 +19,7 @@ with when_used():
     from icrtool.estimation import fit
     from icrtool.fleet import fleet_files, recordings
     from icrtool.logs import read_log
+    from icrtool.logs.containers import recording_files
     from icrtool.output import run_directory
     from icrtool.output.files import formats
     from icrtool.records import requests
@@ -72,6 +73,16 @@ def check_run_config(config: Config, *, free: str = "") -> None:
         raise errors.ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
 
 
+def is_log(source: Path) -> bool:
+    """Return whether an argument is to be read as a log: a file that is no JSON, a bag directory, an address."""
+    if isinstance(source, UrlPath):
+        return not run_directory.is_run_directory(source)
+    if source.is_file():
+        with source.open("rb") as file:
+            return source.suffix != ".json" and file.read(1) != b"{"
+    return recording_files.is_bag_directory(source) or bool(recording_files.split_files(source))
+
+
 class ResultPlace(NamedTuple):
     """Where the runs of a command go, by -o and --into."""
 
@@ -106,6 +117,11 @@ def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[RunPlace
 
 def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:
     """Return a calibration and its name: of a calibration file, or of a run, which is calibrated."""
+    if source is not None and source.suffix == ".json" and not source.exists() and not isinstance(source, UrlPath):
+        raise errors.RunError(source, "no such file", "icrtool calibrate -o makes a calibration file")
+    if source is not None and is_log(source):
+        advice = f"icrtool fit {escaped(str(source))} makes its run, icrtool calibrate -o a calibration file"
+        raise errors.RunError(source, "is a log, not a run or a calibration", advice)
     if source is not None and source.is_file():
         return source.name, formats.open_calibration(source)
     run = run_directory.open_run(source or run_directory.newest_run(RUNS_FOLDER))

@@ -24,7 +24,7 @@ from icrtool.cli.inputs import ResultPlace
 from icrtool.cli.printing import Printer
 from icrtool.records.choices import FigureSet
 from icrtool.records.places import UrlPath, place_of
-from icrtool.records.text import escaped
+from icrtool.records.text import did_you_mean, escaped
 
 with when_used():
     from icrtool import config, errors
@@ -33,6 +33,7 @@ with when_used():
     from icrtool.output import dropout_directory
     from icrtool.output.exports import acceptance
     from icrtool.output.files import atomic, formats
+    from icrtool.records import rows
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
@@ -48,8 +49,57 @@ Change = Callable[[Record], Record]
 REQUESTS_MODULE = "icrtool.records.requests"
 """Where the records are that options make, imported when a command is called."""
 
-POSITIVE = click.FloatRange(min=0, min_open=True)
+
+class _Positive(click.FloatRange):
+    """A number above zero, which says what is wrong with one that has a unit."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401 - as click has it
+        """Return the number, or fail with what to type."""
+        found = re.fullmatch(r"\s*(\d*\.?\d+)\s*([a-zA-Zµ]+)\s*", value) if isinstance(value, str) else None
+        if found is None or found[2].lower() in ("inf", "nan", "e"):
+            return super().convert(value, param, ctx)
+        unit = param.metavar.lower() if param is not None and isinstance(param.metavar, str) else "units"
+        scale = LENGTHS_M.get(found[2]) if unit == "metres" else None
+        meant = f", here {float(found[1]) * scale:g}" if scale is not None else ""
+        raise click.BadParameter(f"{value!r} has a unit; give the number of {unit} alone{meant}", ctx, param)
+
+
+LENGTHS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
+"""Units of length that a user may type, in metres."""
+
+POSITIVE = _Positive(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
+
+
+USUAL = (
+    "output", "robot", "config", "set", "topics", "path", "duration", "speed", "seed", "runs", "jobs", "budget",
+    "calibration", "gate", "baseline", "outage", "plots", "overwrite", "strict", "json", "quiet", "verbose", "help",
+)  # fmt: skip
+"""Names of the options that most calls need, in the order in which a help lists them."""
+
+
+class GroupedCommand(click.Command):
+    """A command whose help lists its usual options first, and the rest under ``More options``."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options of the help."""
+        given = [one for one in self.get_params(ctx) if isinstance(one, click.Option)]
+        shown = [(one, found) for one in given if (found := one.get_help_record(ctx)) is not None]
+        places = {f"--{name}": place for place, name in enumerate(USUAL)}
+
+        def place(one: click.Parameter) -> int | None:
+            return next((places[name] for name in one.opts if name in places), None)
+
+        usual = sorted((pair for pair in shown if place(pair[0]) is not None), key=lambda pair: place(pair[0]) or 0)
+        rest = [pair for pair in shown if place(pair[0]) is None]
+        for title, pairs in (("Options", usual), ("More options", rest)):
+            with formatter.section(title):
+                formatter.write_dl([found for _, found in pairs])
+
+
+def command(name: str, **further: Any) -> Callable[[Command], click.Command]:
+    """Return what makes a command of many options, whose help lists the usual ones first."""
+    return click.command(name, cls=GroupedCommand, **further)
 
 
 def option(names: str, metavar: str | None, kind: object, text: str, **further: Any) -> Option:
@@ -279,7 +329,17 @@ ALLOW_UNUSABLE = flag("--allow-unusable", "Give distances and numbers of runs th
 
 def _lines(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:
     """Return limits, of which a text may hold several; one that is all blank stays, and is refused as no limit."""
-    return tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
+    lines = tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
+    for line in lines:
+        try:
+            model = report.parse_gate(line).model
+        except errors.IcrToolError as err:
+            raise click.BadParameter(str(err)) from err
+        if rows.kind_of(model) not in rows.REPORT_ROWS:
+            names = [f"{row}{turned}" for row in rows.REPORT_ROWS for turned in ("", "_gyro")]
+            meant = did_you_mean(model, names)
+            raise click.BadParameter(f"gate {line!r}: no model {model}; {meant}one of {', '.join(rows.REPORT_ROWS)}")
+    return lines
 
 
 class Exports(NamedTuple):
@@ -323,13 +383,18 @@ def reporting(*further: Option) -> Option:
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.Baseline | None:
     """Find the reports of --baseline; refuse gates that cannot be read, or need one where there is none."""
-    relative = [gate.text for gate in map(report.parse_gate, gates) if gate.baseline_factor]
+    relative = [gate for gate in gates if names_baseline(gate)]
     if place is not None:
         return dropout_directory.open_baseline(place)
     if relative:
         advice = "name it with --baseline REPORT.json|DIR"
         raise errors.ConfigError(f"gate {relative[0]!r}", "needs an earlier report", advice)
     return None
+
+
+def names_baseline(gate: str) -> bool:
+    """Return whether a limit is relative to the baseline."""
+    return report.parse_gate(gate).relative
 
 
 def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:

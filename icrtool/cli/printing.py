@@ -9,7 +9,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -22,6 +22,7 @@ from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
 
 with when_used():
     from icrtool import errors
+    from icrtool.kernels import compiled
     from icrtool.output import text_format
     from icrtool.output.files import atomic, formats
     from icrtool.records import plain_data, samples
@@ -247,6 +248,20 @@ class Stages(LiveLine):
         self.prints_lines = verbose and not quiet and not self.on_terminal
         self._title = name
         self._shown_s = 0.0
+        self._watching = ExitStack()
+
+    def __enter__(self) -> Self:
+        if self.on_terminal:
+            self._watching.enter_context(compiled.watched(self._compiling))
+        return super().__enter__()
+
+    def __exit__(self, *raised: object) -> None:
+        self._watching.close()
+        super().__exit__(*raised)
+
+    def _compiling(self) -> None:
+        """Show why the first command on a computer waits."""
+        self.rewrite(f"{self._title} (compiling, once on this computer) …")
 
     def begin(self, stage: str) -> None:
         """Begin a stage: what is being done, for example ``reading``."""

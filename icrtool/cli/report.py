@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from icrtool.cli.inputs import (
     ResultPlace,
     RunPlace,
     check_run_config,
+    is_log,
     run_directories,
     runs_named,
     runs_or_logs,
@@ -29,7 +31,6 @@ with when_used():
     from icrtool.calibration import transfer
     from icrtool.dropout_analysis import dropout_report as analysis
     from icrtool.fleet import fleet_files
-    from icrtool.logs.containers import recording_files
     from icrtool.output import run_directory
     from icrtool.output.files import atomic, formats
     from icrtool.output.page import pages, render
@@ -72,7 +73,7 @@ def report_command(
     if output is not None and len(sources) > 1:
         advice = "leave it out: each page goes to its own directory"
         raise errors.ConfigError("-o", "names one file for several pages", advice)
-    logs = tuple(source for source in sources if _is_log(source))
+    logs = tuple(source for source in sources if is_log(source))
     if not logs:
         check_run_config(config)
     places = dict(zip(logs, run_directories(logs, ResultPlace(into=into)), strict=True))
@@ -88,16 +89,6 @@ def report_command(
                 result = places[source].directory
             _write_page(result, output, coordinates=not no_coordinates, printer=printer)
     inputs.leave("sources")
-
-
-def _is_log(source: Path) -> bool:
-    """Return whether an argument is to be read as a log: a file that is no JSON, a bag directory, an address."""
-    if isinstance(source, UrlPath):
-        return not run_directory.is_run_directory(source)
-    if source.is_file():
-        with source.open("rb") as file:
-            return source.suffix != ".json" and file.read(1) != b"{"
-    return recording_files.is_bag_directory(source) or bool(recording_files.split_files(source))
 
 
 def _report_on_log(
@@ -197,6 +188,7 @@ def compare_command(
     \b
     Example:
       icrtool compare old=season1/ new=season2/
+      icrtool compare before=may/*.mcap after=june/*.mcap --robot husky-a200
       icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
     """  # noqa: D301 - click reads the escape
     config = settings.load()
@@ -235,10 +227,18 @@ def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
         if len(sources) == 1 and fleet_files.is_fleet(path):
             places = {LogText(group): runs for group, runs in fleet_files.runs_of_fleet(path).items()}
         else:
-            places.setdefault(name, []).append(path)
+            places.setdefault(name, []).extend(_expanded(path))
     if len(places) < 2:
         raise errors.ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
     return places
+
+
+def _expanded(place: Path) -> list[Path]:
+    """Return what a pattern names, which a shell does not expand behind ``NAME=``; else the place itself."""
+    if isinstance(place, UrlPath) or place.exists() or not glob.has_magic(str(place)):
+        return [place]
+    found = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute
+    return [Path(one) for one in found] or [place]
 
 
 def named_place(source: str) -> tuple[LogText, Path]:

@@ -158,7 +158,7 @@ def drive_options(*further: Option, **defaults: object) -> Option:
     return together("path", "icrtool.simulation.drives:PathPlan", of_plan, change=True)
 
 
-@click.command("simulate")
+@options.command("simulate")
 @option("-o --output log", "LOG", FILE, "Log to make: .mcap, .bag, or a ROS 2 directory.", required=True)
 @flag("--force", "Replace a log that is there.")
 @options.SEED
@@ -272,7 +272,7 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
     return "\n".join(lines)
 
 
-@click.command("study")
+@options.command("study")
 @click.argument("name", metavar="NAME", type=click.Choice(get_args(StudyName)))
 @option("-o --output", "DIR", FILE, "Study directory; default icrtool-runs/study-NAME.")
 @together(

@@ -21,7 +21,14 @@ from msgspec.structs import asdict, astuple, replace
 from icrtool import __version__
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import BlockSums, difference_half_width, within_budget
+from icrtool.kernels.error_statistics import (
+    BlockSums,
+    difference_half_width,
+    pooled_variance,
+    student_factor,
+    variance_of_sum,
+    within_budget,
+)
 from icrtool.kernels.track import TrialCounts
 from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M, DISTANCES, METRICS, BudgetDistance, Gate, Verdict
@@ -169,11 +176,13 @@ class BaselineReport:
     ----------
     log : name of its log; path : of the report
     document : what it holds
+    drives : of `pooled_baseline`, the reports of other drives that `document` is the mean of; else none
     """
 
     log: str
     path: str
     document: documents.DropoutDocument
+    drives: tuple[documents.DropoutDocument, ...] = ()
 
     @property
     def sha256(self) -> tuple[str, ...]:
@@ -236,7 +245,82 @@ class BaselineReport:
 
     def is_of(self, run_document: RunDocument) -> bool:
         """Return whether the report was made of the same recording as a run."""
-        return bool(self.sha256) and self.sha256 == run_document.content
+        return not self.drives and bool(self.sha256) and self.sha256 == run_document.content
+
+    def half_width(
+        self, model: str, horizon_m: float, metric: str, now: BlockSums | None, factor: float, *, same: bool
+    ) -> float:
+        """Return half the 95 % interval [m] of ``number - factor * baseline``; NaN where there is none.
+
+        Parameters
+        ----------
+        now : block sums of the number
+        same : both are of the same recording
+
+        Notes
+        -----
+        Of pooled drives: the variance between drives, as these show it and as it is known of other robots
+        (`icrtool.kernels.error_statistics.pooled_variance`), of the new drive and of the mean, and that of the blocks
+        of the new drive.
+        """
+        if not self.drives:
+            return difference_half_width(now, self.at(model, horizon_m)[1], metric, factor, paired=same)
+        if now is None or metric not in {"expected", "p50", "p95"}:
+            return math.nan
+        logarithms = np.log(_positive(_numbers_of(self.drives, model, horizon_m, METRICS[metric])))
+        if not len(logarithms):
+            return math.nan
+        count = len(logarithms)
+        measured = float(logarithms.var(ddof=1)) if count > 1 else 0.0
+        of_drives, freedom = pooled_variance(measured, count - 1.0, row_of(model).spread.between ** 2)
+        before = factor * math.exp(float(logarithms.mean()))
+        between = student_factor(freedom) * math.sqrt(of_drives * (1.0 + 1.0 / count)) * before
+        own = student_factor(len(now.trials) - 1.0) * math.sqrt(variance_of_sum(now.influence(metric)))
+        return math.hypot(between, own)
+
+
+def pooled_baseline(drives: Sequence[documents.DropoutDocument], log: str, path: str) -> BaselineReport:
+    """Return the reports of several drives as one baseline, for a drive that is none of them.
+
+    Parameters
+    ----------
+    drives : at least one, of the same robot
+    log : what the baseline is called; path : where the reports are
+
+    Notes
+    -----
+    A number of the baseline is the geometric mean of those of the drives: errors of drives differ by a factor.
+    """
+    first, models = drives[0], []
+    for model in first.models:
+        rows = []
+        for row in model.by_horizon:
+            found = {name: _numbers_of(drives, model.name, row.horizon_m, name) for name in _ERROR_COLUMNS}
+            means = {name: float(np.exp(np.log(_positive(one)).mean())) for name, one in found.items()
+                     if len(_positive(one))}  # fmt: skip
+            rows.append(replace(row, **{name: means.get(name) for name in _ERROR_COLUMNS}))
+        models.append(replace(model, by_horizon=rows, blocks=[]))
+    return BaselineReport(log, path, replace(first, models=models), tuple(drives))
+
+
+_ERROR_COLUMNS = tuple(name for name in documents.SummaryRow.__struct_fields__ if name not in ("horizon_m", "trials"))
+
+
+def _numbers_of(drives: Sequence[documents.DropoutDocument], model: str, horizon_m: float, name: str) -> Floats:
+    """Return one number of a row at a horizon, of each drive that has it."""
+    rows = [
+        row
+        for drive in drives
+        for one in drive.models
+        for row in one.by_horizon
+        if one.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6)
+    ]
+    column = documents.column_of(rows, name)
+    return np.asarray(column[np.isfinite(column)])
+
+
+def _positive(numbers: Floats) -> Floats:
+    return np.asarray(numbers[numbers > 0.0])
 
 
 def _different_keys(before: Mapping[str, object], now: Mapping[str, object], prefix: str = "") -> Iterator[str]:
@@ -378,9 +462,12 @@ def check_gate(
         if baseline is None:
             why = "this log is not in the baseline"
             return verdict_on(gate, report.run_document.log, value_m=value, passed=True, not_checked=why)
-        before, old = baseline.number_for(gate)
-        same = baseline.is_of(report.run_document)
-        half_width = difference_half_width(sums, old, gate.metric, gate.baseline_factor, paired=same)
+        before, _ = baseline.number_for(gate)
+        if gate.horizon_m is not None:
+            same = baseline.is_of(report.run_document)
+            half_width = baseline.half_width(
+                gate.model, gate.horizon_m, gate.metric, sums, gate.baseline_factor, same=same
+            )
     bound = gate.bound_m + (gate.baseline_factor * before if gate.baseline_factor else 0.0)
     margin = bound - value if gate.relation.startswith("<") else value - bound
     passed = _RELATIONS[gate.relation](value, bound) or (not strict and margin + half_width >= 0.0)

@@ -8,6 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec.structs import replace
@@ -20,13 +21,16 @@ from icrtool.fleet.fleet_files import check_tables
 from icrtool.fleet.one_log import failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import about_recording, as_text, find_recordings, is_manifest, logs_among, read_manifest
-from icrtool.logs.containers.recording_files import files_of_log
+from icrtool.logs.containers.recording_files import file_sha256, files_of_log
 from icrtool.logs.containers.source import RemoteFile
 from icrtool.output.files.formats import CHECKSUM_FILE
 from icrtool.output.run_directory import PAGE_FILE, RUN_FILE
 from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
 from icrtool.records.places import UrlPath, read_regular
 from icrtool.records.requests import BatchRequest, LogRequest
+
+if TYPE_CHECKING:
+    from icrtool.output.dropout_directory import Baseline
 
 POLL_S = 1.0
 """Time between two checks of a cluster [s]."""
@@ -66,13 +70,14 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
     entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
     searched = [place for place in places if not is_manifest(place)]
     searched += [place for entry in entries for place in entry.places]
-    baseline = ""
+    baseline, before = "", None
     if batch.baseline is not None:
         from icrtool.output.dropout_directory import open_baseline
 
         if batch.baseline.resolve() == output.resolve():
             raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")
-        baseline = open_baseline(batch.baseline).digest
+        before = open_baseline(batch.baseline)
+        baseline = before.digest
     requests = []
     for one in find_recordings(searched):
         known, settings = about_recording(one.path, entries), batch.settings
@@ -97,7 +102,19 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
             baseline=os.fsencode(batch.baseline.absolute()) if batch.baseline is not None else b"",
         )  # fmt: skip
         requests.append(request)
+    if before is not None and any(parse_gate(gate).relative for gate in batch.report.gates):
+        before.check_compares(
+            (one.known.log, _content_of(path_of(one.path), before), one.known.robot, one.known.group)
+            for one in requests
+        )
     return requests
+
+
+def _content_of(path: Path, baseline: Baseline) -> tuple[str, ...]:
+    """Return the SHA-256 of each file of a log, where the baseline may have a log of the same content."""
+    if isinstance(path, UrlPath) or not any(baseline.sha256.values()):
+        return ()
+    return tuple(file_sha256(file) for file in files_of_log(path))
 
 
 def finished(request: LogRequest, folder: Path) -> FleetLog | None:

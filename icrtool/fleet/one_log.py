@@ -108,7 +108,10 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
         run, partial = found
         before = None
         if request.baseline:
-            before = open_baseline(path_of(request.baseline)).find(request.known.log, run.document.content)
+            known = request.known
+            before = open_baseline(path_of(request.baseline)).find(
+                known.log, run.document.content, known.robot, known.group
+            )
         report = report_into(partial, run, asked, files, stage, baseline=before)
     summary = run.document
     icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}

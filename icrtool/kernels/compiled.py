@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -52,6 +52,9 @@ _DEBUGGING = ("NUMBA_BOUNDSCHECK", "NUMBA_DEBUGINFO")
 
 _RETURNED = (0, -2)
 """What machine code returns where it raised no exception: it has a result, or None."""
+
+_watchers: list[Callable[[], None]] = []
+"""Called when numba begins to compile a kernel, which is once a computer."""
 
 _parts: list[Callable[..., Any]] = []
 _lock = threading.RLock()
@@ -200,6 +203,8 @@ class Kernel:
             if kept := MachineCode.read(place / file):
                 return kept
         self.compiled += 1
+        for watch in _watchers:
+            watch()
         numba = _numba()
         dispatcher = numba.njit(**_BARE)(self.py_func)
         dispatcher.compile(tuple(numba.typeof(_writable(one)) for one in values))
@@ -221,6 +226,16 @@ class Kernel:
         if _stamp():
             _keep(file, code.written())
         return code
+
+
+@contextmanager
+def watched(watch: Callable[[], None]) -> Iterator[None]:
+    """Have `watch` called whenever numba begins to compile a kernel inside the block."""
+    _watchers.append(watch)
+    try:
+        yield
+    finally:
+        _watchers.remove(watch)
 
 
 def _writable(value: object) -> object:

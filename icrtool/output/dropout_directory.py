@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport, pooled_baseline
 from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats, Ints
@@ -30,7 +30,7 @@ from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
 from icrtool.records.rows import IN_CSV
 from icrtool.records.run_document import known_content
-from icrtool.records.text import escaped
+from icrtool.records.text import counted, escaped
 
 REPORT_FILE = "report.json"
 TRIALS_FILE = "trials.parquet"
@@ -194,12 +194,14 @@ class Baseline:
     path : as it was named
     reports : report.json by name of the log
     sha256 : of each log's files
+    kinds : robot and group of each log whose run can be used; both may be empty
     sources : the files that name the reports: fleet.json of a batch, else the reports
     """
 
     path: Path
     reports: Mapping[str, Path]
     sha256: Mapping[str, tuple[str, ...]]
+    kinds: Mapping[str, tuple[str, str]]
     sources: tuple[Path, ...]
 
     @property
@@ -216,21 +218,64 @@ class Baseline:
         """Return the logs of the baseline that are not among some others, by name."""
         return sorted(set(self.reports) - set(logs))
 
-    def find(self, name: str, content: Collection[str]) -> BaselineReport | None:
-        """Return the report of the log with the same content, else with the same name; None where there is none.
+    def find(self, name: str, content: Collection[str], robot: str = "", group: str = "") -> BaselineReport | None:
+        """Return the report of the log with the same content, else with the same name, else the robot's drives pooled.
 
-        `content` is the SHA-256 of each of the log's files. A baseline of one report file is compared with any log.
+        A baseline of one report file is compared with any log. None where there is nothing to compare with.
+
+        Parameters
+        ----------
+        content : SHA-256 of each of its files
+        robot, group : of the log; an empty group is not known, and stands for all
 
         Raises
         ------
         ConfigError
             The report cannot be read.
         """
+        if (found := self.own_report(name, content)) is not None:
+            return read_baseline(self.reports[found], found, self.folder)
+        if not (drives := self.drives_of(robot, group)):
+            return None
+        pooled = [read_baseline(self.reports[log], log, self.folder).document for log in drives]
+        return pooled_baseline(pooled, f"{counted(len(drives), 'drive')} of {escaped(robot)}", str(self.path))
+
+    def own_report(self, name: str, content: Collection[str]) -> str | None:
+        """Return which log's report is that of a log; None where it is in none, and only others can stand for it."""
         found = next((log for log, files in self.sha256.items() if content and set(content) <= set(files)), None)
         if found is None and self.path.is_file():
             found = next(iter(self.reports))
-        found = found if found is not None else name if name in self.reports else None
-        return read_baseline(self.reports[found], found, self.folder) if found is not None else None
+        return found if found is not None else name if name in self.reports else None
+
+    def drives_of(self, robot: str, group: str = "") -> list[str]:
+        """Return the usable drives of a robot, in one group where both are known; none of a robot without a name."""
+        return [
+            log
+            for log, (its_robot, its_group) in self.kinds.items()
+            if robot and its_robot == robot and (its_group == group or not (its_group and group))
+        ]
+
+    def check_compares(self, logs: Iterable[tuple[str, Collection[str], str, str]]) -> None:
+        """Refuse a baseline with nothing to compare any of some logs with: a limit on it would never be checked.
+
+        Parameters
+        ----------
+        logs : name, content, robot and group of each, as in `find`
+
+        Raises
+        ------
+        ConfigError
+            Neither a log nor its robot is in the baseline.
+        """
+        robots = []
+        for name, content, robot, group in logs:
+            if self.own_report(name, content) is not None or self.drives_of(robot, group):
+                return
+            robots.append(robot)
+        theirs = ", ".join(sorted({escaped(robot) for robot, _ in self.kinds.values() if robot})) or "none with a name"
+        asked = ", ".join(sorted({escaped(robot) for robot in robots if robot})) or "no robot named (--robot)"
+        why = f"neither these logs nor their robot are in it (robots there: {theirs}; asked: {asked})"
+        raise ConfigError(f"--baseline {self.path}", why, "logs are matched by content, else by name, else by robot")
 
 
 def open_baseline(path: Path) -> Baseline:
@@ -247,10 +292,11 @@ def open_baseline(path: Path) -> Baseline:
         logs = {one.log: (path / one.run / DROPOUT_DIRECTORY / REPORT_FILE, one) for one in logs_of_fleet(path)}
         present = {log: found for log, found in logs.items() if is_regular(found[0], path)}
         reports = {log: file for log, (file, _) in present.items()}
+        kinds = {log: (one.robot, one.group) for log, (_, one) in present.items() if one.usable}
         files = {log: known_content(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
         sources: tuple[Path, ...] = (path / FLEET_FILE,)
     else:
-        reports, files = {}, {}
+        reports, files, kinds = {}, {}, {}
         if not (path.is_file() or path.is_dir()):
             if is_special(path):
                 raise ConfigError(f"--baseline {path}", NOT_REGULAR, SAVE_IT)
@@ -263,10 +309,12 @@ def open_baseline(path: Path) -> Baseline:
                 why = f"two reports of logs named {one.log}"
                 raise ConfigError(f"--baseline {path}", why, f"{reports[one.log]} and {file}")
             reports[one.log], files[one.log] = file, one.sha256
+            if one.document.usable:
+                kinds[one.log] = (one.document.run.config.robot.name or "", "")
         sources = tuple(reports.values())
     if not reports:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", BASELINE_ADVICE)
-    return Baseline(path, reports, files, sources)
+    return Baseline(path, reports, files, kinds, sources)
 
 
 def read_baseline(path: Path, log: str = "", inside: Path | None = None) -> BaselineReport:

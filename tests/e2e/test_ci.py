@@ -92,7 +92,7 @@ def test_what_is_not_in_the_baseline_is_reported_and_all_of_it_is_an_error(place
     (baseline / "runs").mkdir(parents=True)
     document = json.loads((place / "baseline" / "fleet.json").read_bytes())
     for one in document["logs"]:
-        one["tool_version"] = "0.0"
+        one["tool_version"], one["robot"] = "0.0", "another"
         if one["log"] == "field.mcap":
             one["log"], one["inputs"] = "gone.mcap", []
         (baseline / one["run"] / "dropout").mkdir(parents=True)
@@ -112,6 +112,19 @@ def test_what_is_not_in_the_baseline_is_reported_and_all_of_it_is_an_error(place
     for one in document["logs"]:
         one["log"], one["inputs"] = f"x{one['log']}", []
     (baseline / "fleet.json").write_text(json.dumps(document), encoding="utf-8")
-    assert icrtool(*command, *gate)[0] == 1
+    status, out, err = icrtool(*command, *gate)
+    assert (status, out) == (1, "")
+    assert "robots there: another; asked: husky-a200" in err
+    assert icrtool("dropout-report", "logs/field.mcap", "--robot", "husky-a200", *command[-2:], *gate)[0] == 1
+    # New recordings are compared with all drives of their robot, and what is met is printed too.
+    for one in document["logs"]:
+        one["robot"] = "husky-a200"
+    (baseline / "fleet.json").write_text(json.dumps(document), encoding="utf-8")
+    status, out, err = icrtool(*command, *gate)
+    assert status == 0, err
+    assert out.count("pass  icr.p95@5m <= 2 * baseline") == 2
+    assert "2 drives of husky-a200" in err
+    verdicts = [one["verdicts"][0] for one in json.loads(Path("results/fleet.json").read_bytes())["logs"]]
+    assert verdicts[0]["baseline_m"] == pytest.approx(verdicts[1]["baseline_m"])
     assert icrtool("batch", "logs", "-o", "results", *gate)[0] == 1, "a gate on a baseline needs one"
     assert icrtool("batch", "logs", "-o", "results", "--baseline", "results")[0] == 1

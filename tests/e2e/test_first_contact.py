@@ -16,6 +16,7 @@ from mcap.writer import Writer
 from icrtool.cli.options import topics_of
 from icrtool.cli.printing import Stages, signal_word
 from icrtool.config import builtin_robots, load_config
+from icrtool.kernels.compiled import Kernel
 
 ROOT = Path(__file__).resolve().parents[2]
 TRACKED = ROOT / "sample_logs" / "tracked_curved.bag"
@@ -53,6 +54,62 @@ def test_a_misspelled_name_is_proposed_right(icrtool, arguments: tuple[object, .
     status, _, err = icrtool(*arguments)
     assert status in (1, 2)
     assert f"did you mean {meant}?" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("fit", TRACKED, "--set", "track_width_m=1"), "did you mean robot.track_width_m?"),
+        (("export", "--for", "json", TRACKED), f"is a log, not a run or a calibration; icrtool fit {TRACKED}"),
+        (("export", "--for", "evo", TRACKED), "is a log, and paths come from a run; icrtool fit"),
+        (("export", "--for", "json", "nosuch.json"), "nosuch.json: no such file; icrtool calibrate -o"),
+    ],
+)
+def test_what_was_meant_stands_in_the_message(icrtool, arguments: tuple[object, ...], part: str) -> None:
+    status, out, err = icrtool(*arguments)
+    assert (status, out) == (1, "")
+    assert part in err
+
+
+def test_help_begins_with_where_to_start_and_the_usual_options(icrtool) -> None:
+    sections = [line for line in icrtool("--help")[1].splitlines() if line.endswith(":") and line[:1].isalpha()]
+    assert sections[-3:] == ["Start here:", "Commands:", "More:"]
+    for command in ("fit", "dropout-report", "batch", "simulate", "study"):
+        usual, _, more = icrtool(command, "--help")[1].partition("\nOptions:\n")[2].partition("\nMore options:\n")
+        assert usual.lstrip().startswith("-o, --output")
+        assert "--robot" in usual
+        assert more.strip().startswith("-")
+    assert "--outage-at" not in icrtool("dropout-report", "--help")[1].partition("More options:")[0]
+
+
+def test_strict_ends_with_3_where_a_run_must_not_be_used(icrtool) -> None:
+    icrtool("simulate", "-o", "straight.mcap", "--path", "straight", "--duration", "60", "-q")
+    command = ("fit", "straight.mcap", "--robot", "pentzer-tracked", "--plots", "none")
+    assert icrtool(*command, "-q")[0] == 0
+    status, _, err = icrtool(*command, "--strict", "-q")
+    assert status == 3
+    assert "do not use this run" in err
+    assert icrtool("fit", MOWER, "--robot", "segway-rmp400", "--plots", "none", "-q", "--strict") == (0, "", "")
+
+
+def test_the_first_run_says_that_it_compiles(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    kernel = Kernel(heading_of)
+    with Stages("log") as stages:
+        stages.begin("filter")
+        assert kernel(1.0) == 2.0
+        assert "log: filter (compiling, once on this computer) …" in capsys.readouterr().err
+        assert kernel(2.0) == 3.0
+        assert "compiling" not in capsys.readouterr().err
+    assert Kernel(heading_of)(1.0) == 2.0
+
+
+def heading_of(value: float) -> float:
+    """Return a number, as a kernel does."""
+    return value + 1.0
 
 
 def test_info_gives_date_extent_verdict_and_a_next_command_that_works(icrtool) -> None:

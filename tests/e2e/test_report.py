@@ -7,9 +7,18 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from icrtool.output.tables.calibration import change_sentence
 from icrtool.pipeline import fit
+from icrtool.records.calibration_document import (
+    CalibrationLog,
+    ComparedGroup,
+    ComparedPair,
+    ErrorDifference,
+    GroupComparison,
+)
 from support.barn import configured, simulate
 
 MOWER = Path(__file__).resolve().parents[2] / "sample_logs" / "wheeled_lawnmower.mcap"
@@ -153,6 +162,42 @@ def test_a_calibration_has_a_page(icrtool: Command, run_directory: Path) -> None
     assert status == 1
     assert errors.startswith("Error: season.json: ")
     assert not Path("other.html").exists()
+
+
+def test_compare_begins_with_a_sentence_and_expands_patterns(icrtool: Command, run_place: Path) -> None:
+    robot = ("--robot", "segway-rmp400")
+    for name, seed in (("a1", 1), ("a2", 2), ("b1", 3)):
+        drive = ("--path", "curved", "--duration", "90", "--seed", seed, "-q")
+        assert icrtool("simulate", "-o", f"{name}.mcap", *drive, *robot)[0] == 0
+    status, output, errors = icrtool("compare", "before=a*.mcap", f"after={run_place}/b*", *robot, "-o", "both.json")
+    assert status == 0, errors
+    first = output.splitlines()[0]
+    assert first.startswith("after against before: no difference of the error found; with these 3 drives a change")
+    document = json.loads(Path("both.json").read_bytes())
+    assert [one["name"] for one in document["groups"]["before"]["logs"]] == ["a1", "a2"]
+    status, _, errors = icrtool("compare", "before=no*.mcap", "after=b1.mcap", *robot)
+    assert status == 1
+    assert "no*.mcap" in errors
+
+
+@pytest.mark.parametrize(("low", "high", "words"), [
+    (-0.4, 1.0, "no difference of the error found; with these 2 drives a change below 1.00 m (95 % at 10 m)"),
+    (0.2, 1.6, "the error is larger by 0.90 m"), (-1.6, -0.2, "the error is smaller by 0.90 m"),
+])  # fmt: skip
+def test_the_smallest_change_that_would_be_seen_follows_from_the_interval(low: float, high: float, words: str) -> None:
+    error = ErrorDifference(10.0, (low + high) / 2, low, high, 0.0, 0.0, 0.0, paired=False)
+    pair = ComparedPair("old", "new", (), (error,), "")
+    log = CalibrationLog("a", "", "", 9.0, 0.0, 0.0)
+    groups = {name: ComparedGroup("icr", (log,), {}) for name in ("old", "new")}
+    found = GroupComparison(
+        schema="icrtool/compare/1", tool_version="0", groups=groups, pairs=(pair,), transfer=(), costs=()
+    )
+    text = change_sentence(pair, found)
+    assert words in text
+    # A true change of this size is beyond the interval in four of five comparisons, of normal errors.
+    smallest = float(text.rpartition("a change below ")[2].split(" m")[0])
+    drawn = np.random.default_rng(1).normal(smallest, (high - low) / 2 / 1.96, 20_000)
+    assert np.mean(drawn > (high - low) / 2) == pytest.approx(0.8, abs=0.02)
 
 
 def test_several_pages_do_not_go_into_one_file(icrtool: Command, run_directory: Path) -> None:

@@ -77,7 +77,7 @@ def test_a_missed_limit_decides_the_exit_status_whatever_became_of_other_logs(ic
         assert "bad.mcap" in line or "drive" in line, "each line names its log"
     status, _, err = icrtool("dropout-report", "bad.mcap", "icrtool-runs/drive", *FAST[2:])
     assert status == 1
-    status, _, err = icrtool("dropout-report", "icrtool-runs/drive", "--gate", "other.p95@2m <= 1", *FAST[2:])
+    status, _, err = icrtool("dropout-report", "icrtool-runs/drive", "--gate", "vendor.p95@2m <= 1", *FAST[2:])
     assert status == 1
     assert "icrtool-runs/drive" in err
 

@@ -26,7 +26,7 @@ from icrtool.output.files.formats import csv_bytes
 from icrtool.output.tables.dropout import parameter_table, reach_row
 from icrtool.output.tables.run import blocks_of_numbers
 from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
-from icrtool.output.text_format import controller_error_text, model_text, plus_minus
+from icrtool.output.text_format import controller_error_text, error_text, model_text, plus_minus
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.fleet_document import BUDGET_M
@@ -297,11 +297,40 @@ def transfer_blocks(found: documents.GroupComparison) -> list[Block]:
     ]
     logs = [f"{name}: {one.name}, {distance_text(one.distance_m)}" for name in names for one in found.groups[name].logs]
     return [
+        *(change_sentence(pair, found) for pair in found.pairs),
         Section("Do they differ?", [Items([pair.verdict for pair in found.pairs])]),
         Section("What a calibration costs elsewhere", cost),
         *map(_pair_section, found.pairs),
         Section("Logs", [Items(logs)], PAGE),
     ]
+
+
+def change_sentence(pair: documents.ComparedPair, found: documents.GroupComparison) -> str:
+    """Return in a sentence whether the errors of two groups differ, and the smallest change that would be seen.
+
+    Notes
+    -----
+    A change is seen where its 95 % interval does not hold zero. A true change of half the interval is seen in one
+    comparison of two; one of `SEEN_HALF_WIDTHS` of it in four of five (power of a normal test).
+    """
+    drives = sum(len(found.groups[name].logs) for name in (pair.first, pair.second))
+    of_drives = f"with these {counted(drives, 'drive')}"
+    row = next((one for one in pair.errors if one.horizon_m == CHOICE_HORIZON_M), None)
+    if row is None or row.p95_m is None or row.p95_low_m is None or row.p95_high_m is None:
+        why = f"no group has enough trials of {CHOICE_HORIZON_M:g} m for an interval"
+        return f"{pair.second} against {pair.first}: not known: {why}."
+    seen = SEEN_HALF_WIDTHS * (row.p95_high_m - row.p95_low_m) / 2.0
+    place = f"(95 % at {CHOICE_HORIZON_M:g} m)"
+    smallest = f"a change below {error_text(seen)} {place} would not have been seen"
+    if row.p95_low_m <= 0.0 <= row.p95_high_m:
+        return f"{pair.second} against {pair.first}: no difference of the error found; {of_drives} {smallest}."
+    word = "larger" if row.p95_m > 0.0 else "smaller"
+    size = with_interval(abs(row.p95_m), *sorted((abs(row.p95_low_m), abs(row.p95_high_m))))
+    return f"{pair.second} against {pair.first}: the error is {word} by {size} {place}; {of_drives} {smallest}."
+
+
+SEEN_HALF_WIDTHS = (1.96 + 0.84) / 1.96
+"""A change of so many half widths of a 95 % interval is seen in 80 % of comparisons: quantiles of 97.5 and 80 %."""
 
 
 def _pair_section(pair: documents.ComparedPair) -> Section:

@@ -10,7 +10,6 @@ import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import difference_half_width
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.text_blocks import VERBOSE, Block, Cell, Chart, Figure, Items, Section, Table
 from icrtool.output.text_format import duration_text, error_text
@@ -222,11 +221,11 @@ def baseline_sections(report: DropoutReport) -> Iterator[Section]:
     for result, (label, metric) in product(report.results, (("95 %", "p95"), ("expected", "expected"))):
         cells, name = [], METRICS[metric]
         for h, horizon_m in shown:
-            row, theirs = baseline.at(result.name, horizon_m)
+            row, _ = baseline.at(result.name, horizon_m)
             before = math.nan if row is None else column_of([row], name)[0]
             difference = float(result.column(name)[h]) - before
             sums = result.block_sums[h] if result.block_sums else None
-            half = difference_half_width(sums, theirs, metric, 1.0, paired=same)
+            half = baseline.half_width(result.name, horizon_m, metric, sums, 1.0, same=same)
             interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
             cells.append(f"{difference:+z.3f} m{interval}" if math.isfinite(difference) else "-")
         rows.append([f"{result.name}, {label}", *cells])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from icrtool.dropout_analysis.dropout_report import dropout_report
-from icrtool.dropout_analysis.report import BaselineReport, DropoutReport, check_gate, parse_gate
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport, check_gate, parse_gate, pooled_baseline
 from icrtool.errors import ConfigError, IcrToolError
 from icrtool.fleet.fleet_files import fleet_document, runs_of_fleet
 from icrtool.kernels.error_statistics import (
@@ -26,6 +26,8 @@ from icrtool.kernels.error_statistics import (
 )
 from icrtool.output.dropout_directory import open_baseline, read_baseline
 from icrtool.output.files.formats import json_bytes
+from icrtool.records.acceptance import Verdict
+from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.fleet_document import FleetFile, FleetLog
 from icrtool.records.run import Run
 from icrtool.records.samples import InputFile
@@ -204,6 +206,82 @@ def test_a_baseline_is_found_by_content_then_by_name(run: Run, report: DropoutRe
     assert found.log == "b"
     assert baseline.find("c", ["other"]) is None
     assert baseline.missing(["a"]) == ["b"]
+
+
+def scaled(report: DropoutReport, factor: float) -> DropoutDocument:
+    """The document of a report whose errors are larger by a factor."""
+    models = [
+        msgspec.structs.replace(
+            one,
+            by_horizon=[
+                msgspec.structs.replace(row, p95_m=row.p95_m * factor, expected_error_m=row.expected_error_m * factor)
+                for row in one.by_horizon
+            ],
+        )
+        for one in report.document.models
+    ]
+    return msgspec.structs.replace(report.document, models=models)
+
+
+def test_a_new_recording_is_compared_with_the_mean_of_the_robots_drives(report: DropoutReport) -> None:
+    """A change that drives of one robot differ by is not a failure, a larger one is."""
+    value = report.result("no_slip").column("p95_m")[1]
+
+    def verdict(*factors: float) -> Verdict:
+        pooled = pooled_baseline([scaled(report, one) for one in factors], "drives", "folder")
+        assert not pooled.is_of(report.run_document)
+        return check_gate(parse_gate("no_slip.p95@2m <= baseline"), report, pooled)
+
+    found = verdict(0.5, 2.0)
+    assert found.baseline_m == pytest.approx(value)
+    assert found.margin_m == pytest.approx(0.0, abs=1e-9)
+    spread = verdict(0.8, 0.8)
+    assert spread.margin_m < 0
+    assert spread.passed
+    assert not verdict(*[0.2] * 6).passed
+    # Drives that are alike give a narrower interval than few, or those that differ.
+    widths = [(one.margin_high_m - one.margin_low_m) / one.baseline_m
+              for one in (verdict(*[1.0] * 12), verdict(1.0, 1.0), verdict(*[0.3, 3.0] * 6))]  # fmt: skip
+    assert widths == sorted(widths)
+
+
+def test_the_interval_of_pooled_drives_holds_the_next_drive(report: DropoutReport) -> None:
+    """Drives drawn with the spread that is known of other robots: 19 of 20 next drives are within the interval."""
+    rng = np.random.default_rng(5)
+    gate = parse_gate("no_slip.expected@2m <= baseline")
+    result = report.result("no_slip")
+    value, half = result.column("expected_error_m")[1], []
+    held, draws = 0, 200
+    for _ in range(draws):
+        # The next drive is the report itself, so the others are drawn about a mean that it was drawn about.
+        mean = math.exp(rng.normal(0.0, 0.45))
+        pooled = pooled_baseline(
+            [scaled(report, mean * math.exp(rng.normal(0.0, 0.45))) for _ in range(4)], "drives", "folder"
+        )
+        before, _ = pooled.number_for(gate)
+        half.append(pooled.half_width("no_slip", 2.0, "expected", result.block_sums[1], 1.0, same=False))
+        held += abs(value - before) <= half[-1]
+    assert 0.88 <= held / draws <= 1.0
+
+
+def test_drives_of_another_robot_or_group_are_not_pooled(report: DropoutReport, tmp_path: Path) -> None:
+    logs = []
+    for name, robot, group in (("a", "husky", "grass"), ("b", "husky", "sand"), ("c", "jackal", "grass")):
+        report.write(tmp_path / "runs" / name / "dropout", plots=())
+        logs.append(FleetLog(name, f"runs/{name}", "done", robot=robot, group=group))
+    logs.append(msgspec.structs.replace(logs[0], log="d", usable=False))
+    (tmp_path / "fleet.json").write_bytes(json_bytes(fleet_document(logs)))
+    baseline = open_baseline(tmp_path)
+    assert baseline.drives_of("husky") == ["a", "b"]
+    assert baseline.drives_of("husky", "sand") == ["b"]
+    assert baseline.drives_of("") == []
+    found = baseline.find("new", ["other"], "husky", "")
+    assert found is not None
+    assert (found.log, len(found.drives)) == ("2 drives of husky", 2)
+    assert baseline.find("new", ["other"], "warthog") is None
+    baseline.check_compares([("new", (), "warthog", ""), ("c", (), "", "")])
+    with pytest.raises(ConfigError, match="robots there: husky, jackal; asked: warthog"):
+        baseline.check_compares([("new", (), "warthog", "")])
 
 
 @pytest.mark.parametrize(("old", "new"), [("}", ""), ("by_horizon", "x"), ("icrtool/dropout/", "other/")])
