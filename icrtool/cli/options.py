@@ -51,7 +51,7 @@ REQUESTS_MODULE = "icrtool.records.requests"
 
 
 class _Positive(click.FloatRange):
-    """A number above zero, which says what is wrong with one that has a unit."""
+    """A number above zero; a text with a unit is refused with the number to type."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401 - as click has it
         """Return the number, or fail with what to type."""
@@ -59,12 +59,12 @@ class _Positive(click.FloatRange):
         if found is None or found[2].lower() in ("inf", "nan", "e"):
             return super().convert(value, param, ctx)
         unit = param.metavar.lower() if param is not None and isinstance(param.metavar, str) else "units"
-        scale = LENGTHS_M.get(found[2]) if unit == "metres" else None
+        scale = METRES_OF_UNIT.get(found[2]) if unit == "metres" else None
         meant = f", here {float(found[1]) * scale:g}" if scale is not None else ""
         raise click.BadParameter(f"{value!r} has a unit; give the number of {unit} alone{meant}", ctx, param)
 
 
-LENGTHS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
+METRES_OF_UNIT = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 """Units of length that a user may type, in metres."""
 
 POSITIVE = _Positive(min=0, min_open=True)

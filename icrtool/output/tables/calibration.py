@@ -325,8 +325,8 @@ def change_sentence(pair: documents.ComparedPair, found: documents.GroupComparis
     if row.p95_low_m <= 0.0 <= row.p95_high_m:
         return f"{pair.second} against {pair.first}: no difference of the error found; {of_drives} {smallest}."
     word = "larger" if row.p95_m > 0.0 else "smaller"
-    size = with_interval(abs(row.p95_m), *sorted((abs(row.p95_low_m), abs(row.p95_high_m))))
-    return f"{pair.second} against {pair.first}: the error is {word} by {size} {place}; {of_drives} {smallest}."
+    size = f"{with_interval(row.p95_m, row.p95_low_m, row.p95_high_m)} {place}"
+    return f"{pair.second} against {pair.first}: the error is {word}: {size}; {of_drives} {smallest}."
 
 
 SEEN_HALF_WIDTHS = (1.96 + 0.84) / 1.96
