@@ -182,7 +182,8 @@ def test_compare_begins_with_a_sentence_and_expands_patterns(icrtool: Command, r
 
 @pytest.mark.parametrize(("low", "high", "words"), [
     (-0.4, 1.0, "no difference of the error found; with these 2 drives a change below 1.00 m (95 % at 10 m)"),
-    (0.2, 1.6, "the error is larger: +0.90 m (+0.20 to +1.60)"), (-1.6, -0.2, "the error is smaller: -0.90 m (-1.60 to -0.20)"),
+    (0.2, 1.6, "the error is larger: +0.90 m (+0.20 to +1.60)"),
+    (-1.6, -0.2, "the error is smaller: -0.90 m (-1.60 to -0.20)"),
 ])  # fmt: skip
 def test_the_smallest_change_that_would_be_seen_follows_from_the_interval(low: float, high: float, words: str) -> None:
     error = ErrorDifference(10.0, (low + high) / 2, low, high, 0.0, 0.0, 0.0, paired=False)
