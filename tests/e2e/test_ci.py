@@ -10,6 +10,7 @@ import re
 import shlex
 import sys
 from pathlib import Path
+from threading import Lock
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -19,6 +20,7 @@ from icrtool.fleet.one_log import process
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.requests import decode_request
 
+ONE_AT_A_TIME = Lock()
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^ *icrtool ((?!cache warm|batch s3:).*)$", PAGE, re.MULTILINE)
 LIMIT = ("--baseline", "baseline", "--gate", "recommended.p95@5m <= 1.1 * baseline")
@@ -34,7 +36,9 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 def in_this_process(request: bytes, timeout_s: float, stage: object = None) -> FleetLog:
     """Process a log of a batch without a process of its own, which would load all libraries again."""
-    return process(decode_request(request), lambda _: None)
+    # Two threads must not be the first to use a module (`icrtool.cli.when_used`).
+    with ONE_AT_A_TIME:
+        return process(decode_request(request), lambda _: None)
 
 
 @pytest.fixture(scope="module")

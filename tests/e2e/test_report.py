@@ -167,9 +167,11 @@ def test_a_calibration_has_a_page(icrtool: Command, run_directory: Path) -> None
 def test_compare_begins_with_a_sentence_and_expands_patterns(icrtool: Command, run_place: Path) -> None:
     robot = ("--robot", "segway-rmp400")
     for name, seed in (("a1", 1), ("a2", 2), ("b1", 3)):
-        drive = ("--path", "curved", "--duration", "90", "--seed", seed, "-q")
+        drive = ("--path", "curved", "--duration", "200", "--seed", seed, "-q")
         assert icrtool("simulate", "-o", f"{name}.mcap", *drive, *robot)[0] == 0
-    status, output, errors = icrtool("compare", "before=a*.mcap", f"after={run_place}/b*", *robot, "-o", "both.json")
+    status, output, errors = icrtool(
+        "compare", "before=a*.mcap", f"after={run_place}/b*.mcap", *robot, "-o", "both.json"
+    )
     assert status == 0, errors
     first = output.splitlines()[0]
     assert first.startswith("after against before: no difference of the error found; with these 3 drives a change")

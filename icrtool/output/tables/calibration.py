@@ -315,12 +315,13 @@ def change_sentence(pair: documents.ComparedPair, found: documents.GroupComparis
     """
     drives = sum(len(found.groups[name].logs) for name in (pair.first, pair.second))
     of_drives = f"with these {counted(drives, 'drive')}"
-    row = next((one for one in pair.errors if one.horizon_m == CHOICE_HORIZON_M), None)
+    measured = (one for one in pair.errors if None not in (one.p95_m, one.p95_low_m, one.p95_high_m))
+    row = min(measured, key=lambda one: abs(one.horizon_m - CHOICE_HORIZON_M), default=None)
     if row is None or row.p95_m is None or row.p95_low_m is None or row.p95_high_m is None:
-        why = f"no group has enough trials of {CHOICE_HORIZON_M:g} m for an interval"
+        why = "the drives are too short for an interval of the difference"
         return f"{pair.second} against {pair.first}: not known: {why}."
     seen = SEEN_HALF_WIDTHS * (row.p95_high_m - row.p95_low_m) / 2.0
-    place = f"(95 % at {CHOICE_HORIZON_M:g} m)"
+    place = f"(95 % at {row.horizon_m:g} m)"
     smallest = f"a change below {error_text(seen)} {place} would not have been seen"
     if row.p95_low_m <= 0.0 <= row.p95_high_m:
         return f"{pair.second} against {pair.first}: no difference of the error found; {of_drives} {smallest}."
