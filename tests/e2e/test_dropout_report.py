@@ -180,7 +180,7 @@ def test_no_run_at_all_is_said_in_one_line(tmp_path: Path) -> None:
     [
         (("--gate", "icr <= 1"), 2, "not of the form"),
         (("--gate", "magic.p95@1m <= 1"), 2, "no model magic"),
-        (("--gate", "recomended.p95@1m <= 1"), 2, "did you mean recommended?"),
+        (("--gate", "icr_finale.p95@1m <= 1"), 2, "did you mean icr_final?"),
         (("--gate", "calibration.p95@1m <= 1"), 1, "no model calibration"),
         (("--budget", "50cm"), 2, "'50cm' has a unit; give the number of metres alone, here 0.5"),
         (("--horizons", "1,x"), 2, "--horizons"),
