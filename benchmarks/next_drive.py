@@ -41,6 +41,17 @@ class Found(NamedTuple):
     p95_m: float
     p95_low_m: float
     p95_high_m: float
+    p95_next_low_m: float
+    p95_next_high_m: float
+
+
+NEXT_ROWS = {
+    "no_slip": "no_slip", "icr": "icr", "recommended": "calibration", "adaptive": "adaptive alone",
+    "icr_gyro": "icr_gyro", "recommended_gyro": "calibration_gyro", "adaptive_gyro": "adaptive_gyro alone",
+}  # fmt: skip
+"""Row of the report of drive A, and the row of drives B and C that drives with the same knowledge."""
+
+SPREAD_AT_M = (5.0, 10.0, 20.0)
 
 
 def report_robot(number: int, drives: dict[str, TrueDrive]) -> Iterator[Found]:
@@ -66,6 +77,7 @@ def report_robot(number: int, drives: dict[str, TrueDrive]) -> Iterator[Found]:
 def found(number: int, name: str, *, usable: bool, rows: list[dict[str, object]]) -> Iterator[Found]:
     """Yield rows of a summary."""
     columns = ("model", "horizon_m", "trials", "expected_error_m", "p95_m", "p95_low_m", "p95_high_m")
+    columns += ("p95_next_low_m", "p95_next_high_m")
     for row in rows:
         yield Found(number, name, usable, *(row[column] for column in columns))  # type: ignore[arg-type]
 
@@ -84,6 +96,27 @@ def geometric_means(rows: list[Found], drive: str) -> dict[str, tuple[float, flo
             expected, p95 = np.exp(np.nanmean(np.log(errors), axis=0)).tolist()
             means[model] = expected, p95
     return means
+
+
+def spreads(rows: list[Found], drive: str) -> Iterator[tuple[str, float, int, float, float, float]]:
+    """Yield what p95 of a drive is, over p95 of drive A of the same robot: the numbers of `icrtool.records.rows`.
+
+    Row, horizon [m], robots, geometric mean of the ratio, standard deviation of its logarithm, and how often the drive
+    lies in the interval that the report of drive A states of the next one.
+    """
+    usable = {row.robot for row in rows if row.drive == "A" and row.usable}
+    by_key = {(row.robot, row.drive, row.model, row.horizon_m): row for row in rows if row.robot in usable}
+    for before, after in NEXT_ROWS.items():
+        for horizon_m in SPREAD_AT_M:
+            pairs = [
+                (by_key.get((robot, "A", before, horizon_m)), by_key.get((robot, drive, after, horizon_m)))
+                for robot in usable
+            ]
+            both = [(a, b) for a, b in pairs if a and b and a.p95_m > 0.0 and b.p95_m > 0.0]
+            if both:
+                ratio = np.log([b.p95_m / a.p95_m for a, b in both])
+                held = np.mean([a.p95_next_low_m <= b.p95_m <= a.p95_next_high_m for a, b in both])
+                yield before, horizon_m, len(both), float(np.exp(ratio.mean())), float(ratio.std()), float(held)
 
 
 def main() -> None:
@@ -108,6 +141,12 @@ def main() -> None:
         for model, (expected, p95) in means.items():
             over = [expected / means[one][0] if one in means else float("nan") for one in ("icr", "calibration")]
             print(f"{model:18} {expected:.3f} / {p95:.3f} m   {over[0]:.2f}  {over[1]:.2f}")
+    for drive, words in (("B", "the same ground"), ("C", "another ground")):
+        print(
+            f"\ndrive {drive}, {words}: p95 over p95 of drive A: geometric mean, std of the logarithm, in the interval"
+        )
+        for model, horizon_m, count, mean, std, held in spreads(rows, drive):
+            print(f"{model:18} {horizon_m:4g} m  {count:3} robots  {mean:.2f}  {std:.2f}  {held:.2f}")
 
 
 if __name__ == "__main__":
