@@ -225,10 +225,9 @@ def error_intervals(
     -----
     Normal logarithms, Student's t (1908). The variance of a drive is the variance that its blocks show, pooled with the
     variance of drives of its length (`pooled_variance`), because few blocks alone would give intervals of any width.
-    p95 changes as the root mean square does, which blocks show better than the few trials above p95; the larger of both
-    variances is used. p95 is smaller on short paths than on long ones: its logarithm by about its variance, and the
-    upper end is raised by that variance. The interval of this drive's p95 does not go below its median, nor above the
-    interval of the next drive.
+    p95 changes as the root mean square does, which blocks show better than the few trials above p95. p95 is smaller on
+    short paths than on long ones: its logarithm by about its variance, and the upper end is raised by that variance.
+    The interval of this drive's p95 does not go below its median, nor above the interval of the next drive.
 
     The next drive, of the same length, adds the variance of its own finite path and the variance between drives.
     """
@@ -238,7 +237,7 @@ def error_intervals(
     if not (expected_m > 0.0 and p95_m > 0.0):
         return Intervals(expected_m, expected_m, p95_m, p95_m, p95_m, p95_m)
     of_length = spread.horizon_std**2 / blocks.horizons
-    measured = (of_length, of_length) if sums is None else _block_variances(errors_m, blocks, sums, expected_m, p95_m)
+    measured = (of_length, of_length) if sums is None else _block_variances(errors_m, blocks, sums, expected_m)
     freedom = 0.0 if sums is None else len(sums.trials) - 1.0
     (of_mean, _), (of_p95, together) = (pooled_variance(one, freedom, of_length) for one in measured)
     of_next = 2.0 * of_p95 + spread.between**2
@@ -251,14 +250,11 @@ def error_intervals(
     return Intervals(expected_m / grown[0], expected_m * grown[0], p95_low, p95_high, next_low, next_high)
 
 
-def _block_variances(
-    errors_m: Floats, blocks: Blocks, sums: BlockSums, expected_m: float, p95_m: float
-) -> tuple[float, float]:
-    """Return the variances of the logarithms of mean and p95 that the blocks show."""
+def _block_variances(errors_m: Floats, blocks: Blocks, sums: BlockSums, expected_m: float) -> tuple[float, float]:
+    """Return the variances of the logarithms of mean and root mean square that the blocks show; both are bounded."""
     squares, trials = np.add.reduceat(errors_m[blocks.rows] ** 2, blocks.first), sums.trials
     of_rms = variance_of_sum(np.asarray(squares / squares.sum() - trials / trials.sum()) / 2.0)
-    of_share = variance_of_sum(sums.influence("p95") / p95_m)
-    return variance_of_sum(sums.influence("expected") / expected_m), max(of_rms, of_share)
+    return variance_of_sum(sums.influence("expected") / expected_m), of_rms
 
 
 def difference_half_width(

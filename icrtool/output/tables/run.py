@@ -156,7 +156,7 @@ def blocks_of_numbers(
     std = max(numbers.left_radius_std, numbers.right_radius_std)
     multiplier = plus_minus(numbers.multiplier, numbers.multiplier_std, sign="")
     rows = [
-        ("wheel_separation_multiplier", f"{multiplier} here, ± {numbers.multiplier_next_std:.2g} on the next drive"),
+        ("wheel_separation_multiplier", f"{multiplier}, next drive ± {numbers.multiplier_next_std:.2g}"),
         ("left, right wheel radius", f"{radii} ± {std:.3f} of the configured"),
     ]
     without = f"(right - left) / {width_m:g} m is the multiplier; without slip: ±{width_m / 2:.3g} m"
