@@ -98,7 +98,7 @@ REPORT_ROWS: dict[str, Row] = {
         Row(
             "adaptive", "motion model that adapts", f"other logs, and {PAST}, {INSTALLATION}",
             "pink", shown=True, pictured=True, in_csv=True, on_robot=True,
-            turned_shown=True, turned_knows=f"other logs, and {PAST}, {INSTALLATION}",
+            turned_knows=f"other logs, and {PAST}, {INSTALLATION}",
         ),
         Row(
             "icr", "ICRs as estimated at each start", f"{PAST}, {INSTALLATION}", "blue", "dashed",

@@ -92,7 +92,7 @@ def stamp_rows(table: TopicTable) -> StampedRows:
         is_set, why = header != 0, f"header stamps are {delay / 1e9:+z.1f} s from log time"
         header = (
             header
-            if is_set.all()
+            if is_set.all() or not is_set.any()
             else np.interp(log_ns, log_ns[is_set], header[is_set] - header[is_set][0]).astype(np.int64)
             + header[is_set][0]
         )

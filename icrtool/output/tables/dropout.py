@@ -57,7 +57,7 @@ from icrtool.records.text import counted, distance_text, shortened
 ReachRow = tuple[str, str, str, str]
 
 NEXT_DRIVE = "next drive, 9 of 10"
-NEXT_DRIVE_MEANS = "next drive: of this robot on this kind of ground; another ground is not shown by this log"
+NEXT_DRIVE_MEANS = "next drive: this robot, this kind of ground; another ground is not shown"
 
 
 def format_dropout(report: DropoutReport) -> str:
@@ -138,7 +138,7 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
         notes |= dict.fromkeys(report.best.as_good, "as good here")
     rows = [reach_row(by_model[name], notes.get(name, "")) for name in first]
     if report.run.config.robot.track_width_m is None:
-        rows.append(("no_slip", "not known", "", "needs robot.track_width_m (--robot, --set)"))
+        rows.append(("no_slip", "not known", "", "needs --robot"))
     leading = by_model.get(best) or by_model.get(WITHOUT_IT)
     if events and leading is not None and (quiet := leading.without_events_text):
         rows.append((f"without its {counted(events, 'slip event')}", quiet, "", leading.model))
@@ -168,7 +168,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
         blocks.append(Table("lrrl", shown, head, "How far without GNSS?"))
         blocks.append(Section("Other models", [Table("lrrl", others, head)], VERBOSE))
     if blocks:
-        blocks += [*best_lines(report), NEXT_DRIVE_MEANS]
+        blocks += [*as_good_lines(report), NEXT_DRIVE_MEANS]
     else:
         blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
@@ -176,13 +176,10 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
     return Section("How far without GNSS?", blocks, lead=lead, text=text)
 
 
-def best_lines(report: DropoutDocument) -> Iterator[str]:
-    """Yield which row has the smallest error by wheels alone, and which rows for comparison are as good."""
-    if (best := report.best) is not None:
-        error = error_text(best.expected_error_m)
-        yield f"{best.model}: {error} expected after {best.horizon_m:g} m, the smallest error by wheels alone"
-        for name in best.as_good:
-            yield f"{name} ({row_of(name).words}) is not shown to be worse: it needs no calibration"
+def as_good_lines(report: DropoutDocument) -> Iterator[str]:
+    """Yield which rows for comparison are as good as the best row."""
+    for name in report.best.as_good if report.best is not None else ():
+        yield f"{name} ({row_of(name).words}) is not shown to be worse: it needs no calibration"
 
 
 def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
@@ -306,7 +303,8 @@ def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:
     if report.recommended is None or summary.config.robot.track_width_m is None:
         return Section("Which numbers into the controller?", number_blocks(summary))
     calibration = stored_calibration(report.recommended)
-    blocks = number_blocks(summary, calibration.controller)
+    controller, *icrs = number_blocks(summary, calibration.controller)
+    blocks = [controller, Section("", icrs, VERBOSE)]
     if alone := controller_error_text(calibration.controller_errors):
         blocks.append(Section("", [alone], VERBOSE))
     with suppress(DataError):
