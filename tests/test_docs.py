@@ -199,7 +199,7 @@ def test_the_readmes_icrs_are_those_of_the_sample_log(readme_session: dict[str, 
         assert rows[label] == f"{geometry[column]:+.3f} ± {geometry[f'{column}_std']:.3f} m"
     next_std = math.hypot(controller["multiplier_std"], controller["multiplier_between_std"])
     here = f"{controller['multiplier']:.3f} ± {controller['multiplier_std']:.3f}"
-    assert rows["multiplier"] == f"{here} here, ± {next_std:.2g} on the next drive"
+    assert rows["multiplier"] == f"{here}, next drive ± {next_std:.2g}"
 
 
 def test_the_readmes_distances_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
