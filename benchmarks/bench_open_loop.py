@@ -9,6 +9,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import RankedTrials, block_sums, cut_blocks, error_intervals, error_summary
 from icrtool.kernels.open_loop import open_loop_errors, open_loop_errors_direct
 from icrtool.kernels.track import FrozenIcrs, Track, trial_ends
+from icrtool.records.rows import GIVEN_SPREAD
 
 RATE_HZ = 100
 HORIZONS_M = np.arange(1.0, 21.0)
@@ -64,7 +65,7 @@ def open_loop_rows(table: Table, hours: float, repeats: int) -> None:
             blocks, p95 = cut_blocks(ends[:, h] >= 0, drive.distance, horizon), float(summary.p95[h])
             ranked = RankedTrials.of(errors[:, h])
             sums = block_sums(errors[:, h], blocks, ranked, float(summary.p50[h]), p95)
-            error_intervals(errors[:, h], blocks, sums, p95)
+            error_intervals(errors[:, h], blocks, sums, float(summary.p50[h]), p95, GIVEN_SPREAD)
 
     jobs = {
         "trial ends, for all models": lambda: trial_ends(drive, HORIZONS_M),

@@ -165,10 +165,11 @@ def _pictured(report: DropoutReport) -> list[ModelResult]:
 
 
 def _models(report: DropoutReport) -> list[ModelResult]:
-    """Return the rows that pictures of distance show, in order, without those for comparison."""
+    """Return the rows that pictures of distance show, the best row first, without the rows for comparison."""
     shown = shown_rows([one.name for one in report.results])
     found = [one for one in _pictured(report) if one.name in shown and not row_of(one.name).compared]
-    return found or list(report.results[:1])
+    best = report.document.best.model if report.document.best is not None else ""
+    return sorted(found, key=lambda one: one.name != best) or list(report.results[:1])
 
 
 def _pens(report: DropoutReport) -> dict[str, style.Look]:
