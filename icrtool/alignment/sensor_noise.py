@@ -154,7 +154,8 @@ def without_bad_start(log: RobotLog) -> RobotLog:
         # refused later
         return log
     seconds = np.diff(gnss.stamp_ns[: 4 * FIRST_FIXES]) / 1e9
-    step = np.hypot(np.diff(gnss.north_m[: 4 * FIRST_FIXES]), np.diff(gnss.east_m[: 4 * FIRST_FIXES]))
+    with np.errstate(over="ignore"):  # positions of damaged logs: an infinite step is a jump
+        step = np.hypot(np.diff(gnss.north_m[: 4 * FIRST_FIXES]), np.diff(gnss.east_m[: 4 * FIRST_FIXES]))
     speed = float(np.quantile(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps), 0.99)) / 2
     noise = NOISIER * (float(np.median(step[FIRST_FIXES:])) + USUAL_POSITION_STD_M)
     jumps = np.flatnonzero(step > BAD_STEP_SPEEDS * speed * seconds + max(BAD_STEP_M, BAD_STEP_SPEEDS * noise))

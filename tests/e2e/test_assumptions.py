@@ -49,5 +49,5 @@ def test_a_warm_start_from_another_robot_is_said(icrtool, tmp_path: Path) -> Non
     assert "track width" not in said
     _, _, said = icrtool(*again, "--set", "robot.track_width_m=0.8", "-o", tmp_path / "other")
     assert "made with a track width of 0.61 m, not 0.8 m" in said
-    _, _, said = icrtool(*again, "--set", "robot.track_width_m=0.8", "-o", tmp_path / "first")
+    _, _, said = icrtool(*again, "--set", "robot.track_width_m=0.8", "-o", tmp_path / "first", "--overwrite")
     assert "made with a track width of 0.61 m, not 0.8 m" in said

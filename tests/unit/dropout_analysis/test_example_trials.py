@@ -48,7 +48,7 @@ def test_the_worst_trials_are_those_of_the_recommended_model(make_run: Callable[
     assert {one.document.model for one in worst} == {"recommended"}
     assert worst[0].start == compared.table.trials[0].starts[np.nanargmax(errors)]
     assert worst[0].document.errors_m["recommended"] == pytest.approx(np.nanmax(errors), abs=1e-4)
-    assert set(worst[0].paths) == {"icr", "no_slip", "recommended", "controller"}
+    assert set(worst[0].paths) == {"icr", "no_slip", "recommended", "controller", "adaptive"}
 
 
 def test_fewer_drives_fit_than_are_asked_for(run: Run) -> None:

@@ -12,6 +12,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import icrtool
 from icrtool.errors import IcrToolError
@@ -167,8 +168,9 @@ def test_a_page_of_an_edited_run_is_refused_in_one_line(
     document = json.loads((place / "run.json").read_text())
     document[section][key] = wrong
     write_run(place, document)
-    with pytest.raises(IcrToolError, match=rf"at `\$\.{section}"):
-        command.main(["report", str(place), "-o", str(tmp_path / "x.html")], standalone_mode=False)
+    found = CliRunner().invoke(command, ["report", str(place), "-o", str(tmp_path / "x.html")])
+    assert found.exit_code == 1
+    assert f"at `$.{section}" in (found.stderr or str(found.exception))
     assert not (tmp_path / "x.html").exists()
 
 

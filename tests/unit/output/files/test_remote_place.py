@@ -149,7 +149,7 @@ def test_a_run_with_a_file_of_somebody_is_not_replaced(store, monkeypatch, capfd
 
 @pytest.mark.parametrize(
     "arguments",
-    [("report", "PLACE"), ("calibrate", "one", "-o", "PLACE"), ("calibrate", "one", "--plot", "PLACE"),
+    [("calibrate", "one", "-o", "PLACE"), ("calibrate", "one", "--plot", "PLACE"),
      ("fit", "a.mcap", "--config", "PLACE"), ("simulate", "-o", "PLACE")],
 )  # fmt: skip
 def test_where_an_address_is_not_taken_it_is_refused_without_its_secrets(monkeypatch, capfd, tmp_path, arguments):
