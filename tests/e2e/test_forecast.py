@@ -50,4 +50,4 @@ def test_what_is_no_calibration_is_one_error(icrtool, plan: Path) -> None:
     status, out, err = icrtool("forecast", "--calibration", plan, "--path", plan)
     assert (status, out) == (1, "")
     assert err.startswith("Error: ")
-    assert "not a run or a calibration" in err or "not a calibration" in err
+    assert "is a log, not a run or a calibration" in err
