@@ -29,7 +29,7 @@ class IcrToolError(Exception):
         """Why it cannot be used, and the advice."""
         return f"{self.why}; {self.advice}" if self.advice else self.why
 
-    def beside(self, *names: str) -> str:
+    def text_without(self, *names: str) -> str:
         """Return the line without its name, for a place that already shows one of some names."""
         what = shortened(str(self.what), LONGEST_NAME)
         return _line(self.reason) if what in (shortened(str(one), LONGEST_NAME) for one in names) else str(self)

@@ -61,7 +61,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     found = _align_once(log, config)
     seen = find_disagreements(found.sensors, width)
     if seen.events:
-        # aligned again without them, where there is enough besides
+        # Aligned again without the events, where the rest of the drive is long enough.
         with suppress(DataError):
             spans = tuple((event.begin_ns, event.end_ns) for event in seen.events)
             found = _align_once(replace(log, slipping_ns=spans), config)

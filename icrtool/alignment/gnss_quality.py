@@ -189,7 +189,7 @@ STRETCH_VARIANCE = 9.0
 """Ratio of a stretch's white variance to the usual one from which on it is float, unless its messages state that it is
 fixed. The usual variance is measured while the robot moves, since jitter of the stamps then adds noise."""
 
-BESIDE_JUMP = 5
+STRETCHES_PER_SIDE = 5
 SIDES_VARIANCE = 1.7
 """Number of stretches before and after a jump that are compared, and the ratio of their variances. The noisier side is
 float if the ratio is larger."""
@@ -224,10 +224,10 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
         noisy = level > STRETCH_VARIANCE * usual
     noisy &= ~flagged[1 : 1 + len(level) * FEWEST_NOISE_STEPS].reshape(-1, FEWEST_NOISE_STEPS).any(axis=1)
     jumps = np.flatnonzero(claimed[steps.jump_row] & claimed[np.maximum(steps.jump_row - 1, 0)])
-    beside, nearby = _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
+    averaged, nearby = _moving_mean(level, STRETCHES_PER_SIDE), _moving_mean(level, 3)
     undecided = []
     for jump in jumps.tolist() if len(jumps) <= MOST_RTK_JUMPS else ():
-        float_side = _noisy_side(beside, nearby, moves, (int(steps.jump_row[jump]) - 1) // FEWEST_NOISE_STEPS)
+        float_side = _noisy_side(averaged, nearby, moves, (int(steps.jump_row[jump]) - 1) // FEWEST_NOISE_STEPS)
         noisy[float_side] = True
         if float_side.start == float_side.stop:
             undecided.append(jump)
@@ -251,15 +251,15 @@ def _moving_mean(level: Floats, width: int) -> Floats:
     return mean
 
 
-def _noisy_side(beside: Floats, nearby: Floats, moves: Bools, at: int) -> slice:
+def _noisy_side(averaged: Floats, nearby: Floats, moves: Bools, at: int) -> slice:
     """Return the float stretches before or after a jump in stretch `at`; none where noise does not show the side."""
-    before, after = at - 1 - BESIDE_JUMP // 2, at + 1 + BESIDE_JUMP // 2
-    if before < 0 or after >= len(beside) or not np.isfinite(beside[[before, after]]).all():
+    before, after = at - 1 - STRETCHES_PER_SIDE // 2, at + 1 + STRETCHES_PER_SIDE // 2
+    if before < 0 or after >= len(averaged) or not np.isfinite(averaged[[before, after]]).all():
         return slice(0, 0)
-    half = BESIDE_JUMP // 2
+    half = STRETCHES_PER_SIDE // 2
     if moves[before - half : before + half + 1].any() != moves[after - half : after + half + 1].any():
         return slice(0, 0)  # fixes of any class are quieter where the robot parks
-    left, right = max(float(beside[before]), USUAL_M2), max(float(beside[after]), USUAL_M2)
+    left, right = max(float(averaged[before]), USUAL_M2), max(float(averaged[after]), USUAL_M2)
     if max(left, right) < SIDES_VARIANCE * min(left, right):
         return slice(0, 0)
     bound = (left * right) ** 0.5

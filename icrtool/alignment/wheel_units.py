@@ -216,9 +216,9 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     if np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:
         bend = np.full(len(chord), np.inf)
         bend[1:-1] = np.abs(np.angle(step[2:] * np.conj(step[:-2]))) / 2
-        beside = usable.copy()
-        beside[1:-1] &= usable[2:] & usable[:-2]
-        straight = beside & (turn < BENT * distance) & (bend < LARGEST_BEND_RAD)
+        enclosed = usable.copy()
+        enclosed[1:-1] &= usable[2:] & usable[:-2]
+        straight = enclosed & (turn < BENT * distance) & (bend < LARGEST_BEND_RAD)
         chord[straight] /= np.sinc(bend[straight] / 2 / math.pi)
     if np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:
         return None

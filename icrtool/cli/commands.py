@@ -24,7 +24,7 @@ _COMMANDS = {
     "config": "Print all configuration keys with their meaning, bounds and defaults, as a TOML file.",
     "cache": "Compile the kernels ahead, for an image or a CI cache.",
     "completion": "Print what bash, zsh or fish needs to complete commands, robots, keys and topics.",
-    "simulate": "Drive a robot of known ICRs and record its log, with the truth beside it.",
+    "simulate": "Drive a robot of known ICRs and record its log, with the truth next to it.",
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",
 }
 

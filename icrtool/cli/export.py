@@ -28,7 +28,7 @@ CONTROLLERS, TRAJECTORIES = get_args(ControllerTarget), get_args(TrajectoryForma
 EXPORT_TARGETS = (*CONTROLLERS, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
 
 TEXT_SUFFIXES = (".txt", ".csv")
-"""Of a file for one trajectory, beside those of the formats; what else a name has after a dot is part of the name."""
+"""Suffixes of a file for one trajectory, in addition to the formats. Other text after a dot belongs to the name."""
 
 ALL_THE_SAME = "--force exports it all the same"
 
@@ -51,7 +51,7 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
       evo, kitti    trajectories in TUM or KITTI format: FILE is the filter's; DIR also gets icr and no_slip
       google-earth  KML: paths, drive over time, outages, slip events
       qgis          GeoJSON: the same, and states and fixes with attributes
-      foxglove      MCAP: odometry, fixes, ICRs, open-loop error, events; the layout is beside it
+      foxglove      MCAP: odometry, fixes, ICRs, open-loop error, events; the layout is next to it
 
     \b
     Example:
@@ -100,7 +100,7 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
 
 
 def _write_foxglove(run: Run, output: Path) -> None:
-    """Write the MCAP file, and the layout beside it."""
+    """Write the MCAP file, and the layout next to it."""
     layout = output.with_name(f"{output.stem}.layout.json")
     atomic.check_place(layout, layout.parent, foxglove.is_layout)
     with atomic.atomic_file(output) as partial:

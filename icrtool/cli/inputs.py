@@ -34,8 +34,8 @@ RUNS_FOLDER = Path("icrtool-runs")
 
 def logs_of(places: tuple[Path, ...], printer: Printer) -> tuple[Path, ...]:
     """Return the logs among the arguments of a command, those in folders too, and warn of files that are none."""
-    logs, beside = recordings.logs_among(places)
-    printer.warn(f"{escaped(str(file))}: not a log: left out" for file in beside)
+    logs, others = recordings.logs_among(places)
+    printer.warn(f"{escaped(str(file))}: not a log: left out" for file in others)
     return tuple(logs)
 
 

@@ -78,7 +78,7 @@ def cache_command() -> None:
 def warm(*, quiet: bool) -> None:
     """Compile all kernels and modules now, so that no later command waits for it: for an image or a CI cache.
 
-    The kernels' code is kept in NUMBA_CACHE_DIR; without it, beside the installed package, or else in the user's
+    The kernels' code is kept in NUMBA_CACHE_DIR; without it, next to the installed package, or else in the user's
     cache. From a NUMBA_CACHE_DIR that can only be read it is used too. With NUMBA_CPU_NAME=generic, here and in later
     commands, it runs on any processor of this architecture.
 

@@ -110,7 +110,7 @@ def _write_page(source: Path, output: Path | None, *, coordinates: bool, printer
         advice = "copy it to a place on disk, or write its page there: icrtool dropout-report ADDRESS"
         raise errors.RunError(source, "is a run at an address", advice)
     place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
-    # A page in its usual place is beside what a stranger may have put there.
+    # The usual folder of a page may hold files of a stranger.
     inside, ours = (place.parent, run_directory.is_page) if output is None else (None, None)
     atomic.check_place(place, inside, ours)
     page = _page_of(source, coordinates=coordinates)

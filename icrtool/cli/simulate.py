@@ -176,7 +176,7 @@ def simulate_command(
     wheel_messages: WheelMessages, convention: HeadingConvention, contacts: Change[FrictionRobot], dynamics: bool,
     tracks: bool, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
-    """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth beside it.
+    """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth next to it.
 
     The kinematics are the paper's (Eqs. 8-10), integrated without error; the sensors those of its Section 4. The robot
     is pentzer-tracked unless --robot, --config or --set robot.… name another. LOG.truth.csv holds the true pose (about
@@ -222,8 +222,8 @@ def simulate_command(
         recorded, truth = drives.simulate(drive, sensed, seed)
         write_log.write_log(fresh_log, recorded, writing)
         simulation_files.write_truth(truth, fresh_truth)
-    beside = simulation_files.truth_path(log)
-    printer.text(f"{_summary(config, drive, truth, seed)}\n\nwritten to {log}, truth to {beside}")
+    truth_file = simulation_files.truth_path(log)
+    printer.text(f"{_summary(config, drive, truth, seed)}\n\nwritten to {log}, truth to {truth_file}")
     printer.detail(f"sensors: {sensed}")
 
 

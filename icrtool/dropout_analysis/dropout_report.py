@@ -130,12 +130,24 @@ def dropout_report(
     without_events, with_jumps : which trials count
     ladder, seed : whether models are tested on held-out distance; seed of the random draws
     score : topics of poses in the log; each becomes a row ``topic:NAME``
-    log, calibrations, baseline, sink : as in `report_on`
+    log : the log of the run, in a form that `icrtool.read_log` takes; scored topics are read from it
+    calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`. Each becomes a row ``calibration``, or
+        ``calibration:STEM`` with the stem of its file where there are several, and a row with ``_gyro`` at the end
+        where both have a gyro. Row ``adaptive`` begins with the first calibration that was not fitted to this log;
+        without one, with other robots
+    baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
+    sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
     Raises
     ------
-    ConfigError, DataError, LogError, RunError
-        As `report_on`.
+    ConfigError
+        A limit, horizon, budget, outage or scored topic that cannot be used, or a calibration of another robot.
+    DataError
+        The run has fewer than two states.
+    LogError
+        The log of scored topics cannot be read.
+    RunError
+        The reference is ``smoothed`` and the run has no smoothed states.
 
     Notes
     -----
@@ -171,27 +183,7 @@ def report_on(
 ) -> report.DropoutReport:
     """Return the dropout report of a request.
 
-    Parameters
-    ----------
-    run : of `icrtool.fit` or `icrtool.open_run`
-    log : the log of the run, in a form that `icrtool.read_log` takes; scored topics are read from it
-    calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`. Each becomes a row ``calibration``, or
-        ``calibration:STEM`` with the stem of its file where there are several, and a row with ``_gyro`` at the end
-        where both have a gyro. Row ``adaptive`` begins with the first calibration that was not fitted to this log;
-        without one, with other robots
-    baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
-    sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
-
-    Raises
-    ------
-    ConfigError
-        A limit, horizon, budget, outage or scored topic that cannot be used, or a calibration of another robot.
-    DataError
-        The run has fewer than two states.
-    LogError
-        The log of scored topics cannot be read.
-    RunError
-        The reference is ``smoothed`` and the run has no smoothed states.
+    `dropout_report` makes the request of its keyword arguments; the other parameters and the errors are the same.
     """
     check_type(run, Run, MAKE_RUN)
     if request.with_jumps:

@@ -376,7 +376,7 @@ def best_row(
     difference.
     """
     own = {one.name for one in calibrations if one.fitted_to_this}
-    # A localisation in the log uses other sensors besides the wheels.
+    # A localisation in the log uses further sensors.
     own |= {one.name for one in errors.results if kind_of(one.name) == TOPIC_ROW}
     rows = {one.name: row_of(one.name) for one in errors.results if not turned_by(one.name) and one.name not in own}
     results = {one.name: one for one in errors.results if one.name in rows and rows[one.name].on_robot}

@@ -65,8 +65,8 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
         raise OutputError(output, "a file is there", "name another place for the batch")
     check_tables(folder, page=batch.files.page)
     # A table of simulated truth next to its log, from a pattern of the shell, is no manifest.
-    beside = logs_among([place for place in places if place.is_file()])[1]
-    places = [place for place in places if place not in beside]
+    left_out = logs_among([place for place in places if place.is_file()])[1]
+    places = [place for place in places if place not in left_out]
     entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
     searched = [place for place in places if not is_manifest(place)]
     searched += [place for entry in entries for place in entry.places]

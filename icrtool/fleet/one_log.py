@@ -52,7 +52,7 @@ def process(request: LogRequest, stage: Stage) -> FleetLog:
         row = _results(request, stage)
     except IcrToolError as err:
         # A full disk may have space the next time, a log may be complete; errors of its content come again.
-        reason = err.beside(str(path), str(folder / request.known.run), log_name(path))
+        reason = err.text_without(str(path), str(folder / request.known.run), log_name(path))
         row = failed(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
     except OSError as err:
         # The log was removed meanwhile, or its disk fails.

@@ -157,14 +157,14 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     logs = list(found.values())
     recordings = [path for path in logs if path.is_dir() or is_recording(path)]
     stems = {_absolute(path).parent / f"{log_name(path)}." for path in recordings}
-    beside = []
+    others = []
     for path in logs:
         # A file with a recording's name and another suffix: drive.truth.csv next to drive.bag.
         file, parts = _absolute(path), path.name.split(".")
         named = {file.parent / f"{'.'.join(parts[:k])}." for k in range(1, len(parts))}
         if path not in recordings and file.is_file() and not stems.isdisjoint(named):
-            beside.append(path)
-    return [path for path in logs if path not in beside], beside
+            others.append(path)
+    return [path for path in logs if path not in others], others
 
 
 def distinct_names(logs: Sequence[Path]) -> list[str]:

@@ -346,8 +346,11 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
     return longest_part(replace(log, inputs=(read,), notes=(*log.notes, *notes)))
 
 
-TOPIC_GAP_IN_INTERVALS, SHORTEST_GAP_S = 5.0, 0.1
-"""Least length of a gap: this multiple of the median interval, and this time [s]."""
+TOPIC_GAP_IN_INTERVALS = 5.0
+"""Least length of a gap, in median intervals of the topic."""
+
+SHORTEST_GAP_S = 0.1
+"""Least length of a gap [s]."""
 
 
 def long_intervals(interval_s: Floats) -> Bools:

@@ -30,9 +30,11 @@ from icrtool.records.places import place_of
 from icrtool.records.text import did_you_mean, listed
 from icrtool.records.topic_poses import TopicPoses
 
-LEAST_QUATERNION, LARGEST_QUATERNION = 0.1, 10.0
-"""Limits of the norm of a quaternion. A message with a norm outside has no orientation; a norm between them counts as
-1."""
+LEAST_QUATERNION = 0.1
+"""Least norm of a quaternion that is an orientation; it then counts as 1."""
+
+LARGEST_QUATERNION = 10.0
+"""Largest norm of a quaternion that is an orientation; it then counts as 1."""
 
 
 def _pose_fields() -> Iterator[tuple[str, tuple[str, ...]]]:

@@ -371,8 +371,8 @@ def log_of(run: Run) -> Path:
     folder = files[0].parent
     series = [numbered_file(file) for file in files]
     if len(files) > 1 and len({one.series for one in series if one is not None}) == 1 and None not in series:
-        beside = {file for file in folder.iterdir() if file.suffix == files[0].suffix}
-        if files[0].suffix == ".bag" or (beside != set(files) and not (folder / "metadata.yaml").is_file()):
+        same_suffix = {file for file in folder.iterdir() if file.suffix == files[0].suffix}
+        if files[0].suffix == ".bag" or (same_suffix != set(files) and not (folder / "metadata.yaml").is_file()):
             return split_path(files)
     return folder if len(files) > 1 or (folder / "metadata.yaml").is_file() else files[0]
 

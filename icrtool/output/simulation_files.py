@@ -15,7 +15,15 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.errors import DataError, OutputError
-from icrtool.output.files.atomic import Kind, atomic_directory, beside, check_directory, place_errors, put, sync_tree
+from icrtool.output.files.atomic import (
+    Kind,
+    atomic_directory,
+    check_directory,
+    partial_at,
+    place_errors,
+    put,
+    sync_tree,
+)
 from icrtool.output.files.formats import csv_bytes, json_bytes, read_numbers, schema_of
 from icrtool.records.choices import StudyName
 from icrtool.records.process_resources import remove
@@ -55,7 +63,7 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
                 raise OutputError(place, "exists already", "--force replaces it")
         if truth.is_dir():
             raise OutputError(truth, "is a directory", "it is left alone; choose another name")
-        with beside(log.absolute(), Path.mkdir) as fresh:
+        with partial_at(log.absolute(), Path.mkdir) as fresh:
             try:
                 yield fresh / log.name, fresh / truth.name
             except OutputError as err:

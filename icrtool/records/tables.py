@@ -245,9 +245,9 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
     columns = _chosen(frame, POSITION, "position", name)
     stated = any(column in frame for pair in POSITION_STD for column in pair)
     stds = _chosen(frame, POSITION_STD, "position", name) if stated else ()
-    beside = [column for column in dict.fromkeys((*stds, "height_m")) if column in frame]
+    further = [column for column in dict.fromkeys((*stds, "height_m")) if column in frame]
     stamps, (first, second) = _rows(frame, columns, "position", name)
-    extra = {column: _at(frame, column, columns, stamps, name) for column in beside}
+    extra = {column: _at(frame, column, columns, stamps, name) for column in further}
     unknown, datum, north, east = np.full(len(stamps), np.nan), None, first, second
     if columns == POSITION[1]:
         from pymap3d import geodetic2ned

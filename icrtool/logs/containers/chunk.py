@@ -20,9 +20,12 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bytes, Ints
 
-LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
+LARGEST_CHUNK_BYTES = 1 << 27
 """Largest decompressed chunk [bytes], an eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; four are
 in memory at a time."""
+
+FREE_BYTES = LARGEST_CHUNK_BYTES
+"""Largest size of a decompressed log of any ratio [bytes]."""
 
 LARGEST_RATIO = 100
 """Largest size of a decompressed log over its size; `FREE_BYTES` more are allowed.

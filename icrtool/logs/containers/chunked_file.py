@@ -24,16 +24,26 @@ from icrtool.logs.containers.chunk import (
 from icrtool.logs.containers.container import Channel, Container, Cut, MessageBlock, ahead, made_ahead
 from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile
 
-CHUNK_THREADS, BLOCKS_AHEAD = 2, 3
-"""Threads that make blocks of chunks, and blocks that they make while one is used."""
+CHUNK_THREADS = 2
+"""Number of threads that make blocks of chunks."""
 
-READERS, SPANS_AHEAD, BYTES_AHEAD = 8, 16, 1 << 26
-"""For a distant file: number of threads that read; number of pieces, and of bytes, that are read before they are
-used."""
+BLOCKS_AHEAD = 3
+"""Number of blocks that the threads make while one is used."""
 
-FIRST_SPAN_BYTES, SPAN_BYTES = 1 << 22, 1 << 24
-"""Bytes of chunks that are read in one piece: of the first piece, which the reader waits for, and of each other
-piece."""
+READERS = 8
+"""Number of threads that read a distant file."""
+
+SPANS_AHEAD = 16
+"""Largest number of pieces of a distant file that are read before they are used."""
+
+BYTES_AHEAD = 1 << 26
+"""Largest number of bytes of a distant file that are read before they are used."""
+
+FIRST_SPAN_BYTES = 1 << 22
+"""Bytes of chunks in the first piece that is read. It is small because the reader waits for it."""
+
+SPAN_BYTES = 1 << 24
+"""Bytes of chunks in each further piece that is read."""
 
 JOINED_BYTES = 1 << 22
 """Bytes of wanted records up to which several chunks become one block: each block has a cost of its own."""

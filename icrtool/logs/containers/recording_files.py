@@ -29,8 +29,11 @@ _ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
 
 STORAGE = re.compile(rf"\.(mcap|db3)(?:{PACKED_SUFFIX})?$")
 
-LARGEST_METADATA_BYTES, _DEEPEST = 1 << 18, 20
-"""Largest size [bytes] and depth of metadata.yaml. A bag of 200 topics has some 100,000 bytes."""
+LARGEST_METADATA_BYTES = 1 << 18
+"""Largest size of metadata.yaml [bytes]. The file of a bag of 200 topics has some 100,000 bytes."""
+
+_DEEPEST = 20
+"""Largest depth of metadata.yaml."""
 
 LONGEST_SPLIT_GAP_S = 3600.0
 """The files of a split recording follow one another without a gap. A longer gap: they are separate recordings."""
@@ -296,8 +299,8 @@ def split_files(path: Path) -> list[Path]:
     first, last = (numbered_file(path.with_name(f"{match[1]}{number}{match[4]}")) for number in (match[2], match[3]))
     if first is None or last is None:
         return []
-    beside = filter(None, (numbered_file(file) for file in path.parent.iterdir() if file.name.startswith(match[1])))
-    between = (one for one in beside if one.series == first.series and first.order <= one.order <= last.order)
+    numbered = filter(None, (numbered_file(file) for file in path.parent.iterdir() if file.name.startswith(match[1])))
+    between = (one for one in numbered if one.series == first.series and first.order <= one.order <= last.order)
     return [one.path for one in sorted(between, key=lambda one: (one.order, one.number))]
 
 

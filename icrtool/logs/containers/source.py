@@ -31,8 +31,11 @@ from icrtool.records.text import LONGEST_NAME
 
 Result = TypeVar("Result")
 
-QUIET_S, SLOWEST_BPS = 15.0, 10_000
-"""Longest time in which a server may send nothing [s]; slowest rate at which it may send a range [bytes/s]."""
+QUIET_S = 15.0
+"""Longest time in which a server may send nothing [s]."""
+
+SLOWEST_BPS = 10_000
+"""Slowest rate at which a server may send a range [bytes/s]."""
 
 _NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
           "http": "aiohttp", "https": "aiohttp"}  # fmt: skip

@@ -30,22 +30,33 @@ from icrtool.logs.containers.container import (
 from icrtool.records.text import LogText
 
 SQLITE_MAGIC = b"SQLite format 3\0"
-_WAL_AT, _IN_WAL_MODE = 18, b"\2"
-"""Place in the header of a database, and the value there where the database uses a write-ahead log."""
+_WAL_AT = 18
+"""Place in the header of a database of the byte that states whether it uses a write-ahead log."""
+
+_IN_WAL_MODE = b"\2"
+"""Value of this byte where the database uses a write-ahead log."""
 
 _TABLES = frozenset({"topics", "messages", "message_definitions"})
 _FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "count"})
 """The tables, columns and functions that our queries use; SQLite refuses everything else."""
 
 _MOST_TOPICS = 1 << 17
-_STEPS, _QUERY_STEPS, _QUERY_STEPS_PER_BYTE = 1 << 16, 1 << 26, 16
-"""Steps of SQLite's virtual machine: between two checks whether to stop; limit of a query; addition to the limit for
-each byte of the file. The pages of a damaged table may refer to one another without end."""
+_STEPS = 1 << 16
+"""Number of steps of SQLite's virtual machine between two checks whether to stop."""
+
+_QUERY_STEPS = 1 << 26
+"""Largest number of steps of SQLite's virtual machine for a query on an empty file. The pages of a damaged table may
+refer to one another without end."""
+
+_QUERY_STEPS_PER_BYTE = 16
+"""Number of steps that a query may take in addition for each byte of the file."""
 
 _FIRST_ROWS, _MOST_ROWS = 64, 1 << 14
-_GROUP_BYTES = _LARGEST_MESSAGE_BYTES = 1 << 24
-"""Bytes of messages that are read together, and of the largest message; messages that icrtool uses have some
-kilobytes."""
+_GROUP_BYTES = 1 << 24
+"""Number of bytes of messages that are read together."""
+
+_LARGEST_MESSAGE_BYTES = 1 << 24
+"""Largest size of a message that is read [bytes]. Messages that icrtool uses have some kilobytes."""
 
 _UNKNOWN_ROWS = 1 << 40
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
@@ -69,7 +80,7 @@ class SqliteBag(Container):
         super().__init__(path, message_compression)
         self._file = path
         self._advice = f"`sqlite3 {path.name} .recover | sqlite3 recovered.db3` may bring back more"
-        self._made_beside: Path | None = None
+        self._made_index: Path | None = None
         self._last_row = 0
         self._steps_left = 0
         self._interruption: BaseException | None = None
@@ -115,8 +126,8 @@ class SqliteBag(Container):
     def close(self) -> None:
         """Release the database; no new file stays next to it."""
         self._database.close()
-        if self._made_beside is not None:
-            self._made_beside.unlink(missing_ok=True)
+        if self._made_index is not None:
+            self._made_index.unlink(missing_ok=True)
         super().close()
 
     def span_ns(self) -> tuple[int, int] | None:
@@ -142,7 +153,7 @@ class SqliteBag(Container):
         """Open the database to read, with the write-ahead log that a recorder leaves when it is killed."""
         log, index = (self._file.with_name(self._file.name + end) for end in ("-wal", "-shm"))
         if log.exists() and log.stat().st_size:
-            self._made_beside = None if os.path.lexists(index) else index
+            self._made_index = None if os.path.lexists(index) else index
             database = self._open("mode=ro")
             try:
                 database.execute("SELECT name FROM sqlite_master")

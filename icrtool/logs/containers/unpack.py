@@ -44,24 +44,34 @@ from icrtool.records.text import LogText, listed
 
 _PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED_SUFFIX})?$|\.db3-wal$|^metadata\.yaml$")
 
-_PIECE_BYTES, _DECODER_BYTES = 1 << 20, LARGEST_CHUNK_BYTES
-"""Bytes that are unpacked at a time, and bytes that a decoder may hold."""
+_PIECE_BYTES = 1 << 20
+"""Number of bytes that are unpacked at a time."""
 
-_MOST_ENTRIES, _MOST_FOLDERS = 100_000, 100
-"""Largest number of entries of an archive that are read, and of folders with logs among them: a recording has one
-folder."""
+_DECODER_BYTES = LARGEST_CHUNK_BYTES
+"""Largest number of bytes that a decoder may hold."""
 
-_LARGEST_EXTRA_BYTES, _LARGEST_READ_BYTES = 1 << 16, 1 << 22
-"""Largest long name in a tar archive [bytes]; largest piece that zipfile reads at once, such as an archive's directory
-[bytes]."""
+_MOST_ENTRIES = 100_000
+"""Largest number of entries of an archive that are read."""
+
+_MOST_FOLDERS = 100
+"""Largest number of folders with logs in an archive. A recording has one folder."""
+
+_LARGEST_EXTRA_BYTES = 1 << 16
+"""Largest long name in a tar archive [bytes]."""
+
+_LARGEST_READ_BYTES = 1 << 22
+"""Largest piece that zipfile reads at once, such as an archive's directory [bytes]."""
 
 _BEHIND = b"icrtool: behind the last frame"
 _TAR_BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
 _SPARSE_MORE = 482
 """Place in the header of a sparse file in a tar archive that states whether a block of places follows it."""
 
-_TAR, _TAR_MARK = b"ustar", slice(257, 262)
-"""Mark of a tar archive, and its place in the first block."""
+_TAR = b"ustar"
+"""Mark of a tar archive."""
+
+_TAR_MARK = slice(257, 262)
+"""Place of the mark of a tar archive in its first block."""
 
 
 class Readable(Protocol):

@@ -368,8 +368,11 @@ _OTHER_NAMES = {
 _FOXGLOVE_KINDS = {"frame_id": "string", "name": "string", "sec": "int64", "nsec": "int64"}
 """Types of fields in Foxglove's schemas, for JSON that states no types; other fields are float64."""
 
-_MOST_PATHS, _MOST_NESTED = 512, 3
-"""Largest number of fields of an unknown type that are listed, and depth of nested messages that are searched."""
+_MOST_PATHS = 512
+"""Largest number of fields of an unknown type that are listed."""
+
+_MOST_NESTED = 3
+"""Largest depth of nested messages of an unknown type that are searched."""
 
 
 def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:

@@ -33,16 +33,27 @@ from icrtool.logs.messages.definitions import (
 )
 from icrtool.records.text import LONGEST_TEXT, LogText
 
-_SHAPES_AT_ONCE, _COMPARED_SHAPES, _TRIED_SHAPES = 1 << 10, 1 << 8, 1 << 4
-"""Largest number of shapes of messages that are decoded at once; largest and smallest number of shapes with which a
-message is compared."""
+_SHAPES_AT_ONCE = 1 << 10
+"""Largest number of shapes of messages that are decoded at once."""
+
+_COMPARED_SHAPES = 1 << 8
+"""Largest number of shapes with which a message is compared."""
+
+_TRIED_SHAPES = 1 << 4
+"""Smallest number of shapes with which a message is compared."""
 
 _MOST_LENGTHS = 512
 """Largest number of lengths in a message that are compared; a message with more lengths is a shape of its own."""
 
-_STEPS_PER_BYTE, _LEAST_STEPS, _MOST_STEPS = 4, 256, 1 << 22
-"""Steps of the program that one message may take: per byte, and at most. Loops over elements of size zero would never
-end. The second limit keeps the time of one message at about a second."""
+_STEPS_PER_BYTE = 4
+"""Number of steps of the program that one message may take for each of its bytes. Loops over elements of size zero
+would never end."""
+
+_LEAST_STEPS = 256
+"""Number of steps of the program that a message of size zero may take."""
+
+_MOST_STEPS = 1 << 22
+"""Largest number of steps of the program that one message of any size may take, about a second."""
 
 _CDR_LITTLE, _CDR_BIG = 1, 0
 

@@ -23,8 +23,11 @@ topics have 100,000."""
 _LEAST_COST = 1000
 """Least cost of any definition, in characters of ROS definitions of the same parsing time."""
 
-_IDL_WEIGHT, _IDL_NUMBER_WEIGHT = 3, 2000
-"""Cost of a character of IDL, and of a number in IDL, in characters of ROS definitions."""
+_IDL_WEIGHT = 3
+"""Cost of a character of IDL, in characters of ROS definitions."""
+
+_IDL_NUMBER_WEIGHT = 2000
+"""Cost of a number in IDL, in characters of ROS definitions."""
 
 _SCHEMA_SHARE = 8
 """Characters of JSON, or bytes of Protobuf, whose cost is one character of ROS definitions."""

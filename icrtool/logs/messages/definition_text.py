@@ -21,12 +21,16 @@ _NAMED = re.compile(r"\s*Definition of\b\s*([\w/]*).*", re.IGNORECASE)
 """A line such as ``Definition of sensor_msgs/JointState:``, which some recorders write before a type."""
 
 _SEPARATOR = f"{SEPARATOR}\n"
-LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
-"""Largest numbers of characters and of types of a message type with all types in it. The longest bundled definition has
-6,000 and 12."""
-LONGEST_IDL, MOST_IDL_NUMBERS = 1 << 16, 256
-"""Largest number of characters of a definition in IDL, and of its numbers (lengths, bounds, constants); the parser
-takes 5 ms for each number."""
+LONGEST_DEFINITION = 1 << 18
+"""Largest number of characters of a message type with all types in it. The longest bundled definition has 6,000."""
+
+MOST_TYPES = 256
+"""Largest number of types in a message type. The bundled definition with the most has 12."""
+LONGEST_IDL = 1 << 16
+"""Largest number of characters of a definition in IDL."""
+
+MOST_IDL_NUMBERS = 256
+"""Largest number of numbers (lengths, bounds, constants) of a definition in IDL. The parser takes 5 ms for each."""
 
 _ANNOTATION = re.compile(r"@\s*[\w:]+(?:\s*\([^()]*\))?")
 _VALUE = re.compile(r"=(?!\s*\w+\s*;)[^;=]*")

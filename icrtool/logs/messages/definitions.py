@@ -37,13 +37,20 @@ SIZES = {
 LONGEST_UNROLLED = 4096
 """Longest fixed array whose elements are taken: a covariance has 36."""
 
-DEEPEST, LONGEST_FIXED, MOST_NUMBERS = 32, 1 << 31, 1 << 16
-"""Bounds of a definition: messages within one another, elements of a fixed array, numbers taken.
+DEEPEST = 32
+"""Largest depth of messages within one another. Real definitions reach 6; a definition that refers to itself has no
+end."""
 
-Real definitions reach a depth of 6; a definition that refers to itself has no end.
-"""
-MOST_ELEMENTS, MOST_TAKEN = 256, 1024
-"""Largest number of elements taken from a sequence, and from all sequences in the elements of a sequence together."""
+LONGEST_FIXED = 1 << 31
+"""Largest number of elements of a fixed array."""
+
+MOST_NUMBERS = 1 << 16
+"""Largest number of numbers that are taken from a message."""
+MOST_ELEMENTS = 256
+"""Largest number of elements taken from a sequence."""
+
+MOST_TAKEN = 1024
+"""Largest number of elements taken from all sequences in the elements of a sequence together."""
 
 Step = str | int | None
 """A field's name, an element's place, or None for all elements of a sequence."""

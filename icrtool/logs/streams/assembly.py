@@ -409,8 +409,11 @@ WHEEL_UNITS: dict[str, tuple[float, WheelUnit]] = {
 }  # fmt: skip
 """Configured units of wheels: the factor of the numbers, and the unit of the products, per second for speeds."""
 
-PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0
-"""Longest interval between samples that is not reported [s]; interval from which a log counts as two recordings [s]."""
+PAUSE_S = 600.0
+"""Longest interval between samples that is not reported [s]."""
+
+LONGEST_PAUSE_S = 86_400.0
+"""Interval between samples from which a log counts as two recordings [s]."""
 
 
 def longest_part(log: RobotLog) -> RobotLog:

@@ -17,8 +17,11 @@ FASTEST_RADPS = math.radians(1000.0)
 MOST_BAD = 0.01
 """Largest share of rates of a used topic that are not finite, or faster than a robot turns."""
 
-SPAN_S, SHORTEST_CHORD_M = 1.0, 0.3
-"""Turns are compared over this time [s], by positions between displacements of at least this length [m]."""
+SPAN_S = 1.0
+"""Time over which turns are compared [s]."""
+
+SHORTEST_CHORD_M = 0.3
+"""Least length of a displacement that shows a turn by positions [m]."""
 
 MOST_SPANS = 20.0
 """Longest time of a displacement of a slow robot, in multiples of `SPAN_S`."""
@@ -26,10 +29,15 @@ MOST_SPANS = 20.0
 FEWEST_TURNS_OF_GYRO = 10
 """Least number of turns to compare; with fewer, the unit that the message type states is used."""
 
-AGREE, LEAST_SCATTER, CLEARER = 0.6, 0.05, 0.25
-"""Turns agree with deg/s if the mean of the unit vectors of their differences is at least `AGREE` long, and their
-scatter (1 minus that length) is below `CLEARER` times the scatter with rad/s, which counts as at least `LEAST_SCATTER`.
-Small turns fit both units."""
+AGREE = 0.6
+"""Least length of the mean of the unit vectors of differences of turns, for turns that agree with deg/s."""
+
+LEAST_SCATTER = 0.05
+"""Smallest scatter (1 minus that length) with rad/s for which the ratio of both scatters is looked at."""
+
+CLEARER = 0.25
+"""Largest ratio of the scatter with deg/s to the scatter with rad/s, for turns that agree with deg/s. Small turns fit
+both units."""
 
 
 def is_in_degrees(t_ns: Ints, rates: Floats, heading: HeadingSamples, fixes: PositionFixes) -> bool:

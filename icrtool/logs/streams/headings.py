@@ -134,8 +134,11 @@ _RAW_WORDS = re.compile(r"raw", re.IGNORECASE)
 _ATTITUDE_WORDS = re.compile(r"quaternion|filter|imu|attitude|orientation|ahrs|xsens|mti", re.IGNORECASE)
 """Topics of QuaternionStamped that hold an inertial unit's orientation, not a receiver's compass angle."""
 
-RAW, NOT_INS = 10.0, 30.0
-"""Subtracted from the worth of a raw topic, and of an odometry of no inertial navigation system."""
+RAW = 10.0
+"""Subtracted from the worth of a raw topic."""
+
+NOT_INS = 30.0
+"""Subtracted from the worth of an odometry of no inertial navigation system."""
 
 UNKNOWN_RAD2 = (2 * np.pi) ** 2
 """Variance from which a heading counts as not known [rad^2], a standard deviation of one turn: drivers of moving bases

@@ -72,13 +72,23 @@ REFERENCE_FRAMES = {"world", "earth", "ecef", "local_enu", "enu", "camera_init"}
 GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
 GOAL = "its name is the name of a goal, not of a measurement"
 
-LEAST_AREA_M, FLAT_RATIO, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
-"""Least width of a drive that shows its plane [m], a standard deviation; largest thickness over width of the plane;
-largest coordinate that is used [m]; number of positions that are used."""
+LEAST_AREA_M = 1.0
+"""Least width of a drive that shows its plane [m], a standard deviation."""
 
-LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
-"""Least and largest distance of a place on earth from the centre [m]. UTM coordinates may reach these values, but have
-a height near 0."""
+FLAT_RATIO = 0.1
+"""Largest ratio of thickness to width of the plane of a drive."""
+
+LARGEST_PLACE_M = 1e8
+"""Largest coordinate that is used [m]."""
+
+MOST_PLACES = 2000
+"""Largest number of positions that the plane of a drive is computed from."""
+
+LEAST_RADIUS_M = 6.33e6
+"""Least distance of a place on earth from the centre [m]. UTM coordinates may reach it, but have a height near 0."""
+
+LARGEST_RADIUS_M = 6.40e6
+"""Largest distance of a place on earth from the centre [m]."""
 
 NO_SOLUTION = Solution("", {})
 
@@ -88,13 +98,17 @@ HIGHEST_M = 20_000.0
 FARTHEST_M = 200_000.0
 """Largest distance of a robot from the middle of its fixes [m]."""
 
-STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
-"""Range of the fixes of a receiver that never moves [m], on a base station or a standing robot; metres in a degree of
-latitude."""
+STILL_M = 0.5
+"""Largest range of the fixes of a receiver that never moves [m], on a base station or a standing robot."""
 
-GOOD_STD_M, NOT_GOOD = 0.3, 35.0
-"""Largest standard deviation of a preferred fix [m], which is RTK or nearly so; subtracted from the worth of other
-fixes."""
+METRES_PER_DEGREE = 111_000.0
+"""Length of a degree of latitude [m]."""
+
+GOOD_STD_M = 0.3
+"""Largest standard deviation of a preferred fix [m], which is RTK or nearly so."""
+
+NOT_GOOD = 35.0
+"""Subtracted from the worth of fixes that are not preferred."""
 
 
 @dataclass(frozen=True, slots=True)

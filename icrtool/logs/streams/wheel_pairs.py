@@ -57,9 +57,15 @@ _OF_WHEELS = re.compile(
 )
 """Words of a message about wheels; the last ones are makes of motor controllers."""
 
-MOST_LOOKED_AT, MOST_SEARCHED, MOST_PATHS = 1 << 21, 1 << 17, 1 << 20
-"""Largest number of characters: of definitions in a log that are searched for words of wheels; of definitions with such
-words, whose fields are searched for sides (some ten types); of the paths of these fields."""
+MOST_LOOKED_AT = 1 << 21
+"""Largest number of characters of definitions in a log that are searched for words of wheels."""
+
+MOST_SEARCHED = 1 << 17
+"""Largest number of characters of definitions with words of wheels, whose fields are searched for sides: some ten
+types."""
+
+MOST_PATHS = 1 << 20
+"""Largest number of characters of the paths of these fields."""
 
 MOST_PAIRS = 256
 """Largest number of pairs of sides of a log that are tried."""

@@ -22,9 +22,14 @@ from icrtool.records.notes import Note, note
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import listed
 
-ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
-"""Positions are recorded modulo a turn if they stay within `ONE_TURN_RAD`, and jump by more than `LEAST_WRAP_RAD` at
-least `FEWEST_WRAPS` times."""
+ONE_TURN_RAD = 2 * np.pi + 1e-3
+"""Largest range of positions that are recorded modulo a turn [rad]."""
+
+LEAST_WRAP_RAD = 1.5 * np.pi
+"""Least jump of a position that is a wrap of a turn [rad]."""
+
+FEWEST_WRAPS = 2
+"""Least number of wraps that show that positions are recorded modulo a turn."""
 
 Quantity = Literal["position", "speed"]
 

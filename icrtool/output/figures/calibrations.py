@@ -249,9 +249,9 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
         middle = error_text(float(np.median(list(logs.values()))))
         label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
         axes.plot([shown[row][2] for row in rows], rows, markersize=5.5, label=label, **look)
-    beside: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False, "bbox": None}
+    centred: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False, "bbox": None}
     for row, (*_, error) in enumerate(shown):
-        style.write_beside(axes, error_text(error), (error, row), (6.0, 0.0), **beside)
+        style.write_near(axes, error_text(error), (error, row), (6.0, 0.0), **centred)
     style.logarithmic_errors(axes)
     style.add_legend(figure, ncols=2)
     return figure

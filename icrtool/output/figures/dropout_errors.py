@@ -219,7 +219,7 @@ def _mark_reaches(
         if not left and one.distance_m > (1.0 - SPACE_OF_LABEL) * axes.get_xlim()[1]:
             offset_pt, ha = (-5.0, -below_pt), "right"
         look: style.Look = {"ha": ha, "va": va, "color": pen["color"], "fontweight": "bold", "zorder": 6}
-        style.write_beside(axes, f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), offset_pt, **look)
+        style.write_near(axes, f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), offset_pt, **look)
         below_pt += 0.0 if left else LABEL_LINE_PT
 
 

@@ -137,7 +137,7 @@ def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, 
             together.append((trial.north_m, trial.east_m, [rank]))
     for north, east, ranks in together:
         look: style.Look = {"fontsize": 8.0, "fontweight": "bold", "ha": "center", "va": "center", "zorder": 3}
-        style.write_beside(axes, " ".join(map(str, ranks)), (east, north), **look)
+        style.write_near(axes, " ".join(map(str, ranks)), (east, north), **look)
     _draw_scale(axes)
     axes.set_title("where they start\non the whole path", **CELL_TITLE)
 
@@ -151,8 +151,8 @@ def _draw_scale(axes: Axes) -> None:
     drawn = np.concatenate([line.get_xydata() for line in axes.lines])
 
     def crossed(corner: tuple[float, float]) -> int:
-        beside, above = (drawn[:, 0] - corner[0]) / width, (drawn[:, 1] - corner[1]) / height
-        inside = (beside > -0.03) & (beside < length / width + 0.03) & (above > -0.04) & (above < 0.13)
+        across, above = (drawn[:, 0] - corner[0]) / width, (drawn[:, 1] - corner[1]) / height
+        inside = (across > -0.03) & (across < length / width + 0.03) & (above > -0.04) & (above < 0.13)
         return int(np.count_nonzero(inside))
 
     left, right = west + 0.05 * width, east - 0.05 * width - length
@@ -160,7 +160,7 @@ def _draw_scale(axes: Axes) -> None:
     x, y = min([(right, low), (left, low), (right, high), (left, high)], key=crossed)
     axes.plot([x, x + length], [y, y], color="black", linewidth=1.6, zorder=7, solid_capstyle="butt")
     look: style.Look = {"ha": "center", "va": "bottom", "fontsize": 7.5, "zorder": 7}
-    style.write_beside(axes, f"{length:g} m", (x + length / 2, y), (0.0, 2.0), **look)
+    style.write_near(axes, f"{length:g} m", (x + length / 2, y), (0.0, 2.0), **look)
 
 
 @style.styled
@@ -268,4 +268,4 @@ def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(*found) > LINE_FROM_PT else None
         side = "left" if found[0] > 0 else "right"
         look: style.Look = {"ha": side, "va": "center", "fontsize": 8.0, "zorder": 6, "arrowprops": line}
-        style.write_beside(axes, text, (float(one.east_m[-1]), float(one.north_m[-1])), found, **look)
+        style.write_near(axes, text, (float(one.east_m[-1]), float(one.north_m[-1])), found, **look)

@@ -154,7 +154,7 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     for row, edge, arrow in ((int(value.argmin()), low_end, "↓"), (int(value.argmax()), high_end, "↑")):
         if not low_end <= value[row] <= high_end:
             text, va = f"{arrow} {signed(value[row])}", "top" if edge == high_end else "bottom"
-            style.write_beside(axes, text, (t[row] / unit, edge), va=va, fontsize=7.5, color=style.BAD_FIX_COLOR)
+            style.write_near(axes, text, (t[row] / unit, edge), va=va, fontsize=7.5, color=style.BAD_FIX_COLOR)
 
 
 def _shade_outages(axes: Axes, run: Run, unit_s: float, label: str) -> None:

@@ -208,7 +208,7 @@ def spot(fill: str, size: float = 5.5, marker: str = "o", color: str = "black") 
     return {"linestyle": "none", "marker": marker, "color": color, "markerfacecolor": fill, "markersize": size}
 
 
-def write_beside(
+def write_near(
     axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[float, float] = (0.0, 0.0), **look: Any
 ) -> None:
     """Write a text at an offset [points] from a place, on a box that hides the lines below it."""

@@ -161,7 +161,7 @@ def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
             text = f"{time:.0f} s" if every < 60 else f"{time / 60:.0f} min" if every < 3600 else f"{time / 3600:.0f} h"
             axes.plot(*place, marker="|", color="black", markersize=7.0, zorder=4.7)
             look: style.Look = {"fontsize": 7.0, "color": "0.25", "zorder": 4.9, "annotation_clip": True}
-            style.write_beside(axes, text, (float(place[0]), float(place[1])), (3.0, 3.0), **look)
+            style.write_near(axes, text, (float(place[0]), float(place[1])), (3.0, 3.0), **look)
 
 
 BOX_HEIGHT_IN = (2.4, 5.4)

@@ -142,7 +142,7 @@ def atomic_file(file: Path, inside: Path | None = None, ours: IsOurFile | None =
     OutputError
         As `check_place`, and for every OSError of the block (disk full, no permission). The old file is then unchanged.
     """
-    with place_errors(file), beside(_place_of_file(file, inside, ours), Path.touch) as partial:
+    with place_errors(file), partial_at(_place_of_file(file, inside, ours), Path.touch) as partial:
         yield partial
         sync(partial)
         put(partial, _place_of_file(file, inside, ours))
@@ -268,7 +268,7 @@ def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) ->
     place = Path(os.path.realpath(directory))
     with place_errors(directory):
         place.parent.mkdir(parents=True, exist_ok=True)
-        with beside(place, Path.mkdir) as partial:
+        with partial_at(place, Path.mkdir) as partial:
             yield partial
             sync_tree(partial)
             check_directory(directory, kind, inside)
@@ -276,7 +276,7 @@ def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) ->
 
 
 @contextmanager
-def beside(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
+def partial_at(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
     """Make a file or directory under a hidden name in the folder of a place, and remove this name at the end.
 
     Hidden files that killed processes left there are removed too.
@@ -313,7 +313,7 @@ def _is_left(path: Path) -> bool:
 
 
 def put(partial: Path, place: Path) -> None:
-    """Put a synced hidden file or directory in its place; `beside` removes the old one.
+    """Put a synced hidden file or directory in its place; `partial_at` removes the old one.
 
     Raises
     ------

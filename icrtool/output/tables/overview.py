@@ -167,7 +167,7 @@ def _topic_text(one: SurveyedTopic) -> str:
 def verdict(run: Run | None, problem: IcrToolError | None, names: Sequence[str]) -> str:
     """Return in a sentence whether a log, of these names, can be fitted and used, and whether it shows the ICRs."""
     if run is None:
-        return f"cannot be fitted: {problem.beside(*names)}" if problem is not None else "cannot be fitted"
+        return f"cannot be fitted: {problem.text_without(*names)}" if problem is not None else "cannot be fitted"
     if not run.usable:
         return f"not usable: {run.document.unusable_because}"
     shown = run.document.excitation.verdict.all_shown
