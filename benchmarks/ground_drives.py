@@ -1,13 +1,11 @@
 """Pairs of drives of skid-steer robots whose slip is made by friction, not by the motion models of icrtool.
 
 Each robot drives three times: A and B on one ground, whose friction is drawn again within what grounds of one kind
-differ by, and C on another one. Robots, grounds, paths and slip are drawn with fixed seeds. All drives are simulated
-together, a row of the arrays each: 84 drives of 200 s take about 15 s.
-
-Planar rigid body, clockwise angles, x forward, y right. Each contact of a wheel or of a part of a track slides with a
-velocity s, and the ground pulls back with mu N s / sqrt(s^2 + s_0^2), less sideways than along the wheel. s_0 grows
-with the wheel's speed (shear of the ground). Load moves with the lateral acceleration; rolling resistance, side slopes
-and friction that varies along the path act too.
+differ by, and C on another one. Robots, grounds, paths and slip are drawn with fixed seeds.
+`icrtool.simulation.friction` drives them: each contact of a wheel or of a part of a track slides with a velocity s, and
+the ground pulls back with mu N s / sqrt(s^2 + s_0^2), less sideways than along the wheel. s_0 grows with the wheel's
+speed (shear of the ground). Load moves with the acceleration; rolling resistance, slopes and friction that varies along
+the path act too.
 """
 
 from __future__ import annotations
@@ -22,9 +20,16 @@ from icrtool.kernels.arrays import Floats
 from icrtool.records.samples import GyroSamples, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText
+from icrtool.simulation.friction import FrictionRobot, slide_path
 
-SECONDS, STEP_S, KEPT_EVERY = 200.0, 0.002, 5
-GRAVITY = 9.81
+SECONDS, STEP_S = 200.0, 0.01
+
+LAG_S = 0.15
+"""Time constant of the motors [s]."""
+
+UNEVEN_LENGTH_M = 5.0
+"""Distance over which the friction's variation is correlated [m]."""
+
 DRIVES = ("A", "B", "C")
 START_NS = 1_760_000_000_000_000_000
 
@@ -125,97 +130,47 @@ def _commands(robot: GroundRobot, rng: np.random.Generator, n: int) -> tuple[Flo
 
 def simulate(count: int, seed: int = 40) -> list[dict[str, TrueDrive]]:
     """Return the drives of some robots, by name."""
-    n = int(SECONDS / STEP_S)
-    robots, grounds, commands, uneven, slopes = [], [], [], [], []
+    made = []
     for number in range(count):
         rng = np.random.default_rng([seed, number])
         robot, ground = draw_robot(rng), draw_ground(rng)
-        for each in (of_one_kind(ground, rng), of_one_kind(ground, rng), draw_ground(rng)):
-            # a robot's load differs a little from drive to drive
-            robots.append(
-                replace(robot, mass_forward_m=robot.mass_forward_m + robot.width_m * float(rng.normal(0.0, 0.01)))
-            )
-            grounds.append(each)
-            commands.append(_commands(robot, rng, n))
-            length_s = 8.0 / robot.speed_mps
-            uneven.append([1.0 + each.uneven * np.clip(_wander(rng, length_s, n), -2.5, 2.5) for _ in range(2)])
-            slopes.append([each.slope * _wander(rng, 2.0 * length_s, n) for _ in range(2)])
-    states = _integrate(robots, grounds, np.array(commands), np.array(uneven), np.array(slopes))
-    t = np.arange(states.shape[2]) * STEP_S * KEPT_EVERY
-    made = []
-    for number in range(count):
         drives = {}
-        for i, name in enumerate(DRIVES):
-            row = len(DRIVES) * number + i
-            robot = robots[row]
-            north, east, heading, left, right = states[:, row]
-            sides = (left / robot.left_scale, right / robot.right_scale)
-            drives[name] = TrueDrive(f"robot{number:02d}{name}", robot.width_m, 0.15, t, north, east, heading, *sides)
+        for name, each in zip(
+            DRIVES, (of_one_kind(ground, rng), of_one_kind(ground, rng), draw_ground(rng)), strict=True
+        ):
+            # a robot's load differs a little from drive to drive
+            loaded = replace(robot, mass_forward_m=robot.mass_forward_m + robot.width_m * float(rng.normal(0.0, 0.01)))
+            drives[name] = _drive(f"robot{number:02d}{name}", loaded, each, rng)
         made.append(drives)
     return made
 
 
-def _integrate(
-    robots: list[GroundRobot], grounds: list[Ground], commands: Floats, uneven: Floats, slopes: Floats
-) -> Floats:
-    """Return north, east, heading, rolled left and right (5, drives, n) of all drives."""
-    of_robot = {name: np.array([getattr(one, name) for one in robots]) for name in GroundRobot.__dataclass_fields__}
-    of_ground = {
-        name: np.array([getattr(one, name) for one in grounds])[:, None, None] for name in Ground.__dataclass_fields__
-    }
-    width, base = of_robot["width_m"][:, None, None], of_robot["base_m"]
-    most = int(of_robot["contacts"].max())
-    # contacts (drives, side, contact); of robots with fewer the others bear no load
-    x, share = np.zeros((len(robots), 2, most)), np.zeros((len(robots), 2, most))
-    for row, one in enumerate(robots):
-        places = np.linspace(-0.5, 0.5, one.contacts) * base[row]
-        lever = places * one.mass_forward_m / np.mean(places**2)
-        for side in range(2):
-            x[row, side, : one.contacts] = places
-            share[row, side, : one.contacts] = np.maximum(1.0 + lever, 0.05) / one.contacts / 2.0
-        share[row] /= share[row].sum()
-    y = np.array([-0.5, 0.5])[None, :, None] * width
-    x = x - of_robot["mass_forward_m"][:, None, None]
-    y = y - of_robot["mass_right_m"][:, None, None]
-    aside, height = of_robot["mass_right_m"] / of_robot["width_m"], of_robot["height_m"] / of_robot["width_m"]
-    inertia = (of_robot["width_m"] ** 2 + (1.4 * base) ** 2) / 12.0
-    drives, _, n = commands.shape
-    v_x, v_y, omega, wheels = np.zeros(drives), np.zeros(drives), np.zeros(drives), np.zeros((drives, 2))
-    pose = np.zeros((5, drives))
-    kept = np.empty((5, drives, n // KEPT_EVERY))
-    sign = np.array([-1.0, 1.0])
-    lag = STEP_S / 0.15
-    forward, right_of = of_robot["mass_forward_m"], of_robot["mass_right_m"]
-    for i in range(n):
-        if i % KEPT_EVERY == 0:
-            row = i // KEPT_EVERY
-            kept[:, :, row] = pose
-            # the body's origin, from the centre of mass
-            cos, sin = np.cos(pose[2]), np.sin(pose[2])
-            kept[0, :, row] -= forward * cos - right_of * sin
-            kept[1, :, row] -= forward * sin + right_of * cos
-        wheels += lag * (commands[:, :, i] - wheels)
-        # load goes to the outer side of a turn
-        load = 1.0 + 2.0 * sign * (aside - height * v_x * omega / GRAVITY)[:, None]
-        load = np.clip(load, 0.1, 1.9)[:, :, None] * share * GRAVITY
-        rolled = wheels[:, :, None]
-        along = v_x[:, None, None] - omega[:, None, None] * y
-        across = v_y[:, None, None] + omega[:, None, None] * x
-        slide, sideways = along - rolled, of_ground["sideways"] * across
-        width_mps = of_ground["slide_mps"] + of_ground["slide_share"] * np.abs(rolled)
-        pull = of_ground["friction"] * uneven[:, :, i, None] * load / np.sqrt(slide**2 + across**2 + width_mps**2)
-        drag = of_ground["resistance"] * load * np.tanh(along / 0.02)
-        f_x, f_y = -pull * slide - drag, -pull * sideways
-        torque = (x * f_y - y * f_x).sum(axis=(1, 2)) / inertia
-        a_x = f_x.sum(axis=(1, 2)) + GRAVITY * slopes[:, 0, i] + omega * v_y
-        a_y = f_y.sum(axis=(1, 2)) + GRAVITY * slopes[:, 1, i] - omega * v_x
-        v_x, v_y, omega = v_x + STEP_S * a_x, v_y + STEP_S * a_y, omega + STEP_S * torque
-        pose[2] += STEP_S * omega
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        pose[0] += STEP_S * (v_x * cos - v_y * sin)
-        pose[1] += STEP_S * (v_x * sin + v_y * cos)
-        pose[3:] += STEP_S * wheels.T
-    return kept
+def _drive(name: str, robot: GroundRobot, ground: Ground, rng: np.random.Generator) -> TrueDrive:
+    """Return one drive, with the wheel speeds of `_commands` as they are."""
+    t = np.arange(round(SECONDS / STEP_S)) * STEP_S
+    left, right = _commands(robot, rng, len(t))
+    slope = np.column_stack([ground.slope * _wander(rng, 16.0 / robot.speed_mps, len(t)) for _ in range(2)])
+    half = robot.width_m / 2.0
+    truth = slide_path(
+        sliding_robot(robot, ground), t, (left + right) / 2.0, (left - right) / robot.width_m,
+        np.ones(len(t), np.bool_), (half, -half, 0.0), start_heading_rad=0.0, lag_s=LAG_S, rng=rng, slope=slope,
+        steers=False,
+    )  # fmt: skip
+    north, east, heading = truth.pose.T
+    sides = truth.travel_left_m / robot.left_scale, truth.travel_right_m / robot.right_scale
+    return TrueDrive(name, robot.width_m, 0.15, t, north, east, heading, *sides)
+
+
+def sliding_robot(robot: GroundRobot, ground: Ground) -> FrictionRobot:
+    """Return a robot on a ground as `icrtool.simulation.friction` drives it."""
+    return FrictionRobot(
+        mass_kg=1.0, half_track_m=robot.width_m / 2.0,
+        contact_forward_m=tuple((np.linspace(0.5, -0.5, robot.contacts) * robot.base_m).tolist()),
+        mass_forward_m=robot.mass_forward_m, mass_right_m=robot.mass_right_m, mass_height_m=robot.height_m,
+        gyration_m=math.sqrt((robot.width_m**2 + (1.4 * robot.base_m) ** 2) / 12.0), friction=ground.friction,
+        lateral_friction=ground.sideways, friction_std=ground.uneven, friction_length_m=UNEVEN_LENGTH_M,
+        creep=ground.slide_share, slip_mps=ground.slide_mps, resistance=ground.resistance,
+    )  # fmt: skip
 
 
 def measure(drive: TrueDrive, seed: int, *, gyro: bool = True) -> RobotLog:

@@ -21,6 +21,7 @@ from icrtool.calibration.record import Calibration, controller_numbers, fitted_d
 from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.observability import WEAK_SHARE
+from icrtool.estimation.odometry import odometry_icrs
 from icrtool.estimation.run_filter import noise_of
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
@@ -30,7 +31,7 @@ from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.notes import Note, note
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.rows import INSTALLATION, PAST, row_of
-from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, no_slip_icrs, vendor_icrs, width_or_usual_m
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, vendor_icrs, width_or_usual_m
 from icrtool.records.run_document import GeometryDocument, RunDocument
 
 
@@ -246,15 +247,13 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
 
 def models_of(run: Run) -> tuple[Model, ...]:
     """Return the filter's ICRs at each start, its final ICRs, and the ICRs of track width and published skid factor."""
-    table = run.table
-    momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    models = [Model("icr", momentary, momentary_knows(run))]
-    if (width := run.track_width_m) is not None:
-        models.append(Model(NO_SLIP, FrozenIcrs.constant(*no_slip_icrs(width))))
+    driven = odometry_icrs(run.table, run.track_width_m)
+    models = [Model("icr", driven["icr_momentary"], momentary_knows(run))]
+    if "no_slip" in driven:
+        models.append(Model(NO_SLIP, driven["no_slip"]))
     if (published := vendor_icrs(run.document)) is not None:
         models.append(Model("vendor", FrozenIcrs.constant(*published)))
-    final = FrozenIcrs.constant(*table.icrs_at(-1))
-    return (*models, Model("icr_final", final))
+    return (*models, Model("icr_final", driven["icr"]))
 
 
 def momentary_knows(run: Run) -> str:

@@ -23,7 +23,13 @@ from icrtool.dropout_analysis.topic_rows import topic_rows
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
-from icrtool.kernels.error_statistics import FEWEST_PATH_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_PATH_BLOCKS
+from icrtool.kernels.error_statistics import (
+    FEWEST_PATH_BLOCKS,
+    HORIZONS_A_BLOCK,
+    LEVEL,
+    MOST_PATH_BLOCKS,
+    NEXT_LEVEL,
+)
 from icrtool.kernels.open_loop import TOLERANCE_M
 from icrtool.logs.topic_poses import read_topic_poses
 from icrtool.records import dropout_document as documents
@@ -326,6 +332,7 @@ def _report(
             block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_PATH_BLOCKS} to {MOST_PATH_BLOCKS} blocks",
             level=LEVEL,
             seed=request.seed,
+            next_level=NEXT_LEVEL,
         ),
         models=tuple(one.document for one in errors.results),
         trials=tuple(_counts(errors, with_events)),

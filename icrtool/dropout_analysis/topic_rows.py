@@ -11,7 +11,7 @@ import numpy as np
 
 from icrtool.calibration.run_models import ComparedRow
 from icrtool.errors import ConfigError
-from icrtool.estimation.odometry import drive_wheels
+from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Complexes, Floats, Ints, rows_at_steps
 from icrtool.kernels.track import OpenLoopPath, Track
 from icrtool.motion.recording import TrialErrors, Trials
@@ -145,7 +145,7 @@ def departure_of(poses: TopicPoses, t: Floats, track: Track, covered: np.ndarray
 
 def _wheels_depart(run: Run, track: Track, covered: np.ndarray) -> bool:
     """Return whether the error of the wheels' path grows over the drive, so that the reference shows such errors."""
-    path = drive_wheels(run.table, run.in_gap, run.table.icrs_at(-1))
+    path = drive_wheels(run.table, run.in_gap, odometry_icrs(run.table, None)["icr"])
     rows = _compared_rows(track, covered)
     found = _departure(path.north_m[rows] + 1j * path.east_m[rows], track.place[rows], track.distance[rows])
     return found is not None and found.grows is True

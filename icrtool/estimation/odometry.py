@@ -13,11 +13,11 @@ import numpy as np
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, trapezoids, unwrapped
 from icrtool.kernels.kinematics import chord_rows
 from icrtool.kernels.open_loop import open_loop_pieces
-from icrtool.kernels.track import OpenLoopPath
+from icrtool.kernels.track import FrozenIcrs, OpenLoopPath
 from icrtool.records.measurements import MeasuredHeading, ReferenceJump
 from icrtool.records.run import Run, no_slip_icrs, track_of_states
 from icrtool.records.run_document import DriveDocument
-from icrtool.records.tables import Icrs, States
+from icrtool.records.tables import States
 
 SHORTEST_STEP_M, STEP_IN_STD = 0.1, 5.0
 """Smallest length of a chord of the driven path, in metres and in standard deviations of the position."""
@@ -35,31 +35,49 @@ class OdometryPath:
     north_m, east_m : float64 (n,), at every recorded state, or at some of them
     heading_rad : float64 (n,), clockwise from north, unwrapped
     end_error_m : distance to the filter's estimate at the last state
+    mean_error_m, max_error_m : mean and largest distance to the filter's estimate, over every recorded state
     """
 
     north_m: Floats
     east_m: Floats
     heading_rad: Floats
     end_error_m: float
+    mean_error_m: float
+    max_error_m: float
 
 
-OdometryName = Literal["icr", "no_slip"]
+OdometryName = Literal["icr", "icr_momentary", "no_slip"]
 
 
-def odometry_icrs(run: Run) -> dict[OdometryName, Icrs]:
-    """Return the constant ICRs of a run's odometries: its final ICRs, and where b is known the ICRs without slip."""
-    icrs: dict[OdometryName, Icrs] = {"icr": run.table.icrs_at(-1)}
-    return icrs if run.track_width_m is None else icrs | {"no_slip": no_slip_icrs(run.track_width_m)}
+def momentary_icrs(table: States) -> FrozenIcrs:
+    """Return the ICRs that the filter had estimated at each state (n,)."""
+    return FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
 
 
-def drive_wheels(table: States, in_gap: Bools, icrs: Icrs, every: int = 1) -> OdometryPath:
+def odometry_icrs(table: States, track_width_m: float | None) -> dict[OdometryName, FrozenIcrs]:
+    """Return the ICRs of a drive's odometries: final, momentary, and where b is known the ICRs without slip.
+
+    Notes
+    -----
+    Pentzer 2014, Section 6.1: the final ICRs for the circles, the most recent ICRs at each step for all other paths.
+    """
+    icrs: dict[OdometryName, FrozenIcrs] = {
+        "icr": FrozenIcrs.constant(*table.icrs_at(-1)),
+        "icr_momentary": momentary_icrs(table),
+    }
+    if track_width_m is not None:
+        icrs["no_slip"] = FrozenIcrs.constant(*no_slip_icrs(track_width_m))
+    return icrs
+
+
+def drive_wheels(table: States, in_gap: Bools, icrs: FrozenIcrs, every: int = 1) -> OdometryPath:
     """Drive from the first state to the last; through a gap in the wheel data move as the filter did.
 
     Parameters
     ----------
     table : the recorded states
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
-    icrs : the run's final ones, or `no_slip_icrs`
+    icrs : one triple for the whole path, or one for each state
     every : number of states between two kept points of the path; the last state is kept, too
 
     Notes
@@ -68,15 +86,18 @@ def drive_wheels(table: States, in_gap: Bools, icrs: Icrs, every: int = 1) -> Od
     of the odometry at the begin of the gap, so that a gap does not change the error.
     """
     kept = np.append(np.arange(0, len(table) - 1, every), len(table) - 1)
-    path = OpenLoopPath(*np.empty((3, len(kept))))
+    path, total_m, largest_m = OpenLoopPath(*np.empty((3, len(kept)))), 0.0, 0.0
     for rows, piece in _pieces(table, in_gap, icrs):
         here = slice(*np.searchsorted(kept, [rows.start, rows.stop]))
         for column, values in zip(path, piece, strict=True):
             column[here] = values[kept[here] - rows.start]
-    return OdometryPath(*path, math.hypot(path.north[-1] - table.north_m[-1], path.east[-1] - table.east_m[-1]))
+        away_m = np.hypot(piece.north - table.north_m[rows], piece.east - table.east_m[rows])
+        total_m, largest_m = total_m + float(away_m.sum()), max(largest_m, float(away_m.max()))
+    end_m = math.hypot(path.north[-1] - table.north_m[-1], path.east[-1] - table.east_m[-1])
+    return OdometryPath(*path, end_m, total_m / len(table), largest_m)
 
 
-def _pieces(table: States, in_gap: Bools, icrs: Icrs) -> Iterator[tuple[slice, OpenLoopPath]]:
+def _pieces(table: States, in_gap: Bools, icrs: FrozenIcrs) -> Iterator[tuple[slice, OpenLoopPath]]:
     """Yield the path of `drive_wheels` in order, some states at a time: paths are as long as columns of the run."""
     track = track_of_states(table, in_gap, np.empty((0, 2), np.int64))
     edges = np.flatnonzero(in_gap[:-1])
@@ -90,7 +111,7 @@ def _pieces(table: States, in_gap: Bools, icrs: Icrs) -> Iterator[tuple[slice, O
             miss_north += step_north * cos - step_east * sin - step_north
             miss_east += step_north * sin + step_east * cos - step_east
         path = OpenLoopPath(*(np.array([one]) for one in (north, east, psi)))
-        for rows, piece in chain([(slice(first, first + 1), path)], open_loop_pieces(track, *icrs, first, last)):
+        for rows, piece in chain([(slice(first, first + 1), path)], open_loop_pieces(track, icrs, first, last)):
             ahead_north, ahead_east = piece.north - north, piece.east - east
             path = OpenLoopPath(
                 north + miss_north + ahead_north * cos - ahead_east * sin,

@@ -19,7 +19,7 @@ from icrtool.estimation.observability import (
     multiplier_std,
     unlearned_icrs,
 )
-from icrtool.estimation.odometry import drive_summary, drive_wheels
+from icrtool.estimation.odometry import OdometryName, drive_summary, drive_wheels, odometry_icrs
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import (
     antenna_warning,
@@ -37,12 +37,11 @@ from icrtool.records.notes import Note, about, note, unusable_because, warnings_
 from icrtool.records.plain_data import known
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import FitRequest
-from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, no_slip_icrs, track_of_states
+from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, track_of_states
 from icrtool.records.run_document import (
     RUN_SCHEMA,
     ChangeDocument,
     ClassDocument,
-    EndErrorDocument,
     EventDocument,
     ExcitationDocument,
     FilterDocument,
@@ -52,6 +51,7 @@ from icrtool.records.run_document import (
     IcrDocument,
     NumberByIcr,
     OdometryDocument,
+    PathErrorDocument,
     ReferenceJumpDocument,
     RunDocument,
     SegmentDocument,
@@ -131,12 +131,7 @@ def summarise(
         usable=not unusable,
         unusable_because=unusable_because(notes),
         icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, multiplier, hidden),
-        odometry=OdometryDocument(
-            EndErrorDocument(drive_wheels(table, filtered.in_gap, table.icrs_at(-1), len(table)).end_error_m),
-            None
-            if width is None
-            else EndErrorDocument(drive_wheels(table, filtered.in_gap, no_slip_icrs(width), len(table)).end_error_m),
-        ),
+        odometry=_odometry(table, filtered.in_gap, width),
         terrain=TerrainDocument(tuple(map(ChangeDocument, changes_s))),
         segments=segment_summary(table, changes_s),
         gnss=gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes, measurements),
@@ -156,6 +151,15 @@ def summarise(
         filter=filter_summary(measurements, filtered, config),
         excitation=excitation,
     )  # fmt: skip
+
+
+def _odometry(table: States, in_gap: Bools, width_m: float | None) -> OdometryDocument:
+    """Return the errors of the paths by wheel speeds alone."""
+    errors: dict[OdometryName, PathErrorDocument] = {}
+    for name, icrs in odometry_icrs(table, width_m).items():
+        path = drive_wheels(table, in_gap, icrs, len(table))
+        errors[name] = PathErrorDocument(path.end_error_m, path.mean_error_m, path.max_error_m)
+    return OdometryDocument(errors["icr"], errors.get("no_slip"), errors["icr_momentary"])
 
 
 def _notes(

@@ -10,17 +10,14 @@ from icrtool.kernels.compiled import njit
 
 GRAVITY_MPS2 = 9.81
 
-SLOWEST_SLIP_MPS = 0.02
-"""Sliding speed at which friction is 0.7 of its limit while a track stands [m/s]: it keeps the equations smooth."""
+ROLLING_MPS = 0.02
+"""Speed at which the rolling resistance is 0.7 of its limit [m/s]: it keeps the equations smooth about standstill."""
 
 LONGEST_SUBSTEP_S = 0.001
 """Longest step of the integration [s]: friction damps a sliding contact within some 3 ms."""
 
 LOAD_FOLLOWS_S = 0.05
 """Time constant with which the load of the contacts follows the acceleration [s]: the suspension of the body."""
-
-LARGEST_TURN_RADPS = 2.0
-"""Largest turn rate that the driver commands [rad/s]."""
 
 
 class SlidingBody(NamedTuple):
@@ -29,11 +26,14 @@ class SlidingBody(NamedTuple):
     Attributes
     ----------
     mass : [kg]; inertia : about the vertical axis through the centre of mass [kg m^2]
-    mass_forward, mass_height : centre of mass, ahead of the body origin and above the ground [m]
-    creep : share of the track speed at which friction is 0.7 of its limit
+    mass_forward, mass_right, mass_height : centre of mass, ahead and right of the body origin, above the ground [m]
+    slip, creep : sliding speed at which friction is 0.7 of its limit: while a track stands [m/s], and its growth with
+        the track speed
     lateral : friction sideways over friction along the track
+    resistance : rolling resistance over load
     lag : time constant of the motors [s]; 0: none
     steering : turn rate commanded for a heading error [1/s]
+    largest_turn : largest turn rate that the driver commands [rad/s]
     y_right, y_left : ICRs by which the driver turns velocities into track speeds [m]
     cell : length of the cells of `grip` [m]
     """
@@ -41,11 +41,15 @@ class SlidingBody(NamedTuple):
     mass: float
     inertia: float
     mass_forward: float
+    mass_right: float
     mass_height: float
+    slip: float
     creep: float
     lateral: float
+    resistance: float
     lag: float
     steering: float
+    largest_turn: float
     y_right: float
     y_left: float
     cell: float
@@ -54,7 +58,7 @@ class SlidingBody(NamedTuple):
 @njit
 def slide(  # noqa: PLR0915 - the equations of one step, in the order in which they act
     t: Floats, forward: Floats, turn: Floats, heading: Floats, decides: Ints, contact_x: Floats, contact_y: Floats,
-    grip: Floats, body: SlidingBody, commands: Floats, tracks: Floats, pose: Floats, velocity: Floats,
+    grip: Floats, slope: Floats, body: SlidingBody, commands: Floats, tracks: Floats, pose: Floats, velocity: Floats,
 ) -> None:  # fmt: skip
     """Integrate the motion of a robot on sliding contacts, and of the driver who steers it.
 
@@ -65,6 +69,7 @@ def slide(  # noqa: PLR0915 - the equations of one step, in the order in which t
     decides : (n,) 1 where the driver gives new commands, else 0
     contact_x, contact_y : (c,) contacts, body frame (x forward, y right) [m]; the sign of y is the side
     grip : (g, 2) friction coefficient of left and right side by cell of distance; it repeats
+    slope : (n, 2) downhill slope ahead and to the right, as a share of the weight
     body : constants
     commands, tracks : (n, 2) become commanded and true track speeds, left and right [m/s]
     pose : (n, 3) row 0 is the start; becomes N, E [m], psi [rad]
@@ -89,7 +94,7 @@ def slide(  # noqa: PLR0915 - the equations of one step, in the order in which t
     for k in range(len(t)):
         if decides[k]:
             wanted = turn[k] + body.steering * (heading[k] - psi)
-            wanted = min(max(wanted, -LARGEST_TURN_RADPS), LARGEST_TURN_RADPS)
+            wanted = min(max(wanted, -body.largest_turn), body.largest_turn)
             command_left, command_right = forward[k] - body.y_left * wanted, forward[k] - body.y_right * wanted
         if k == 0:
             left, right, u = command_left, command_right, forward[0]
@@ -98,7 +103,7 @@ def slide(  # noqa: PLR0915 - the equations of one step, in the order in which t
         v_y = w - omega * body.mass_forward
         commands[k, 0], commands[k, 1], tracks[k, 0], tracks[k, 1] = command_left, command_right, left, right
         pose[k, 0], pose[k, 1], pose[k, 2] = north, east, psi
-        velocity[k, 0], velocity[k, 1], velocity[k, 2] = u, v_y, omega
+        velocity[k, 0], velocity[k, 1], velocity[k, 2] = u + omega * body.mass_right, v_y, omega
         if k + 1 == len(t):
             break
         steps = math.ceil((t[k + 1] - t[k]) / LONGEST_SUBSTEP_S - 1e-9)
@@ -112,28 +117,33 @@ def slide(  # noqa: PLR0915 - the equations of one step, in the order in which t
             v_y = w - omega * body.mass_forward
             cell = int(driven / body.cell) % cells
             per_x = (GRAVITY_MPS2 * body.mass_forward - a_x * body.mass_height) * body.mass / sum_xx
-            per_y = -a_y * body.mass_height * body.mass / sum_yy
+            per_y = (GRAVITY_MPS2 * body.mass_right - a_y * body.mass_height) * body.mass / sum_yy
+            v_x = u + omega * body.mass_right
             force_x, force_y, moment = 0.0, 0.0, 0.0
             for i in range(c):
                 x, y = contact_x[i], contact_y[i]
                 load = max(body.mass * GRAVITY_MPS2 / c + per_x * x + per_y * y, 0.0)
                 track = right if y > 0.0 else left
-                slip_x, slip_y = u - omega * y - track, v_y + omega * x
-                smooth = SLOWEST_SLIP_MPS + body.creep * abs(track)
+                along = v_x - omega * y
+                slip_x, slip_y = along - track, v_y + omega * x
+                smooth = body.slip + body.creep * abs(track)
                 limit = grip[cell, 1 if y > 0.0 else 0] * load
                 held = limit / math.sqrt(slip_x * slip_x + slip_y * slip_y + smooth * smooth)
-                f_x, f_y = -held * slip_x, -held * body.lateral * slip_y
+                drag = body.resistance * load * along / math.sqrt(along * along + ROLLING_MPS * ROLLING_MPS)
+                f_x, f_y = -held * slip_x - drag, -held * body.lateral * slip_y
                 force_x += f_x
                 force_y += f_y
-                moment += (x - body.mass_forward) * f_y - y * f_x
-            of_x, of_y = force_x / body.mass, force_y / body.mass
+                moment += (x - body.mass_forward) * f_y - (y - body.mass_right) * f_x
+            of_x = force_x / body.mass + GRAVITY_MPS2 * slope[k, 0]
+            of_y = force_y / body.mass + GRAVITY_MPS2 * slope[k, 1]
             a_x, a_y = a_x + (of_x - a_x) * followed, a_y + (of_y - a_y) * followed
             u, w, omega = u + dt * (of_x + omega * w), w + dt * (of_y - omega * u), omega + dt * moment / body.inertia
             v_y = w - omega * body.mass_forward
+            v_x = u + omega * body.mass_right
             middle = psi + 0.5 * dt * omega
-            north += dt * (u * math.cos(middle) - v_y * math.sin(middle))
-            east += dt * (u * math.sin(middle) + v_y * math.cos(middle))
+            north += dt * (v_x * math.cos(middle) - v_y * math.sin(middle))
+            east += dt * (v_x * math.sin(middle) + v_y * math.cos(middle))
             psi += dt * omega
-            driven += dt * math.sqrt(u * u + v_y * v_y)
+            driven += dt * math.sqrt(v_x * v_x + v_y * v_y)
         # The mean speed over the step, which gives the distance that the tracks travelled.
         tracks[k, 0], tracks[k, 1] = mean_left, mean_right

@@ -136,21 +136,23 @@ def open_loop_path(
     """
     path = OpenLoopPath(*np.empty((3, end - start + 1)))
     path.north[0], path.east[0], path.heading[0] = track.north[start], track.east[start], track.heading[start]
-    for reached, some in open_loop_pieces(track, y_icr_right, y_icr_left, x_icr, start, end):
+    for reached, some in open_loop_pieces(track, FrozenIcrs.constant(y_icr_right, y_icr_left, x_icr), start, end):
         for column, values in zip(path, some, strict=True):
             column[reached.start - start : reached.stop - start] = values
     return path
 
 
-def open_loop_pieces(
-    track: Track, y_icr_right: float, y_icr_left: float, x_icr: float, start: int, end: int
-) -> Iterator[tuple[slice, OpenLoopPath]]:
-    """Yield the states after `start` piece by piece, and the path of `open_loop_path` at them."""
-    separation, turned, place = max(abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M), 0.0, 0j
+def open_loop_pieces(track: Track, icrs: FrozenIcrs, start: int, end: int) -> Iterator[tuple[slice, OpenLoopPath]]:
+    """Yield the states after `start` piece by piece, and the open-loop path at them.
+
+    `icrs` hold one triple for the whole path, or one for each state of the track: each step is driven with its own.
+    """
+    turned, place = 0.0, 0j
     ahead = cmath.exp(1j * track.heading[start])
     for lo in range(start, end, ROWS_AT_ONCE):  # paths of whole drives are as long as a column of the run
         some = slice(lo, min(lo + ROWS_AT_ONCE, end))
-        over = track.held[some] / separation
+        y_icr_right, y_icr_left, x_icr = (column if len(column) == 1 else column[some] for column in icrs)
+        over = track.held[some] / np.maximum(np.abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M)
         left, right = track.v_left[some] * over, track.v_right[some] * over
         turn = left - right
         heading = turned + np.cumsum(np.append(0.0, turn))

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-PATH_WORDS = {"filter": "filter", "smoothed": "smoother", "icr": "ICR odometry", "no_slip": "no-slip odometry"}
+PATH_WORDS = {
+    "filter": "filter", "smoothed": "smoother", "icr": "ICR odometry", "icr_momentary": "momentary-ICR odometry",
+    "no_slip": "no-slip odometry",
+}  # fmt: skip
 
 GLOSSARY = {
     "ICR": "Instantaneous centre of rotation of a track: the point of the ground, seen from the robot, about which it "

@@ -344,12 +344,20 @@ class ExampleTrial:
 
 
 class IntervalsDocument(Record, frozen=True):
-    """How the intervals were found."""
+    """How the intervals were found.
+
+    Attributes
+    ----------
+    level : probability that the interval of a number of this drive contains the true value
+    next_level : probability that the interval of the next drive contains its number; missing in reports of earlier
+        versions
+    """
 
     method: str
     block: str
     level: float
     seed: int
+    next_level: float | UnsetType = UNSET
 
 
 class DropoutDocument(Record, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import Annotated, Generic, Literal, TypeVar
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from icrtool.config import Config
 from icrtool.records.measurements import (
@@ -128,17 +129,33 @@ class IcrDocument(Record, frozen=True, kw_only=True):
                 raise ValueError(f"only some of final, final_std, mean and std are known of {name}")
 
 
-class EndErrorDocument(Record, frozen=True):
-    """How far from the filter's last position an odometry ends."""
+class PathErrorDocument(Record, frozen=True):
+    """How far an odometry of the whole drive is from the filter's position.
+
+    Attributes
+    ----------
+    end_error_m : at the last state
+    mean_error_m, max_error_m : over all states; missing in runs of earlier versions
+    """
 
     end_error_m: float
+    mean_error_m: float | UnsetType = UNSET
+    max_error_m: float | UnsetType = UNSET
 
 
 class OdometryDocument(Record, frozen=True):
-    """Wheels-only paths."""
+    """Paths by wheel speeds alone, from the first state to the last (Pentzer 2014, Section 6.1).
 
-    icr: EndErrorDocument
-    no_slip: EndErrorDocument | None
+    Attributes
+    ----------
+    icr : with the final ICRs
+    icr_momentary : with the ICRs that the filter had estimated at each state; missing in runs of earlier versions
+    no_slip : None where the track width is not known
+    """
+
+    icr: PathErrorDocument
+    no_slip: PathErrorDocument | None
+    icr_momentary: PathErrorDocument | UnsetType = UNSET
 
 
 class ChangeDocument(Record, frozen=True):

@@ -15,6 +15,9 @@ from icrtool.simulation.truths import FrictionTruth
 STEERING_HZ = 0.5
 """Ratio of the turn rate that the driver commands to the heading error [rad/s per rad]. An error halves in 1.4 s."""
 
+LARGEST_TURN_RADPS = 2.0
+"""Largest turn rate that the driver commands [rad/s]."""
+
 GRIP_CELL_M = 0.1
 """Length of the cells of ground in which the friction is constant [m]."""
 
@@ -41,11 +44,15 @@ class FrictionRobot:
     contact_forward_m : places of the contacts of a side, ahead of the body origin: two wheels, or a track's road wheels
     mass_forward_m, mass_height_m : centre of mass, ahead of the body origin and above the ground
     gyration_m : radius of gyration about the vertical axis
-    friction : Coulomb's coefficient along the track; lateral_friction : sideways, as a multiple of it. With 2.4 the
-        wheeled robot has the mean ICRs of the paper's Table II, with 2.0 the tracked robot has the mean ICRs of Table
-    I. friction_std : standard deviation of the friction of each side along the path, as a share of it friction_length_m
-    : distance over which the friction's variation is correlated creep : share of the track speed at which friction is
-    0.7 of its limit: soft ground has more
+    friction : Coulomb's coefficient along the track
+    lateral_friction : sideways, as a multiple of it. With 2.4 the wheeled robot has the mean ICRs of the paper's Table
+        II, with 2.0 the tracked robot has the mean ICRs of Table I.
+    friction_std : standard deviation of the friction of each side along the path, as a share of it
+    friction_length_m : distance over which the friction's variation is correlated
+    creep : share of the track speed at which friction is 0.7 of its limit: soft ground has more
+    slip_mps : sliding speed at which friction is 0.7 of its limit while a track stands
+    resistance : rolling resistance over load
+    mass_right_m : centre of mass, right of the body origin
     """
 
     mass_kg: float = 118.0
@@ -59,6 +66,9 @@ class FrictionRobot:
     friction_std: float = 0.1
     friction_length_m: float = 2.0
     creep: float = 0.03
+    slip_mps: float = 0.02
+    resistance: float = 0.0
+    mass_right_m: float = 0.0
 
 
 TRACKED_ROBOT = FrictionRobot(
@@ -71,7 +81,7 @@ TRACKED_ROBOT = FrictionRobot(
 def scaled_robot(robot: FrictionRobot, track_width_m: float) -> FrictionRobot:
     """Return a robot of another track width b [m]: lengths grow with b, the mass with its square."""
     factor = track_width_m / (2.0 * robot.half_track_m)
-    lengths = ("half_track_m", "mass_forward_m", "mass_height_m", "gyration_m")
+    lengths = ("half_track_m", "mass_forward_m", "mass_right_m", "mass_height_m", "gyration_m")
     return replace(
         robot,
         mass_kg=robot.mass_kg * factor**2,
@@ -98,7 +108,7 @@ def draw_grip(robot: FrictionRobot, rng: np.random.Generator) -> Floats:
 
 def slide_path(
     robot: FrictionRobot, t: Floats, forward: Floats, turn: Floats, decides: Bools, icrs_m: Icrs, *,
-    start_heading_rad: float, lag_s: float, rng: np.random.Generator,
+    start_heading_rad: float, lag_s: float, rng: np.random.Generator, slope: Floats | None = None, steers: bool = True,
 ) -> FrictionTruth:  # fmt: skip
     """Return the motion of a robot whose driver follows the headings of a path.
 
@@ -110,21 +120,26 @@ def slide_path(
     icrs_m : ICRs by which the driver turns velocities into track speeds
     lag_s : time constant of the motors; 0: none
     rng : draws the ground
+    slope : (n, 2) downhill slope ahead and to the right, as a share of the weight; default: flat ground
+    steers : the driver corrects the heading; False: `forward` and `turn` are commanded as they are
     """
     heading = start_heading_rad + np.concatenate([[0.0], np.cumsum(turn[:-1] * np.diff(t))])
     x = np.array(robot.contact_forward_m * 2, np.float64)
     y = np.repeat([robot.half_track_m, -robot.half_track_m], len(robot.contact_forward_m))
     body = SlidingBody(
         mass=robot.mass_kg, inertia=robot.mass_kg * robot.gyration_m**2, mass_forward=robot.mass_forward_m,
-        mass_height=robot.mass_height_m, creep=robot.creep, lateral=robot.lateral_friction, lag=lag_s,
-        steering=STEERING_HZ, y_right=float(icrs_m[0]), y_left=float(icrs_m[1]), cell=GRIP_CELL_M,
+        mass_right=robot.mass_right_m, mass_height=robot.mass_height_m, slip=robot.slip_mps, creep=robot.creep,
+        lateral=robot.lateral_friction, resistance=robot.resistance, lag=lag_s,
+        steering=STEERING_HZ if steers else 0.0, largest_turn=LARGEST_TURN_RADPS if steers else np.inf,
+        y_right=float(icrs_m[0]), y_left=float(icrs_m[1]), cell=GRIP_CELL_M,
     )  # fmt: skip
     n = len(t)
     commands, tracks, pose, velocity = (np.empty((n, columns)) for columns in (2, 2, 3, 3))
     pose[0] = 0.0, 0.0, start_heading_rad
     slide(
         t, np.asarray(forward, np.float64).copy(), np.asarray(turn, np.float64).copy(), heading,
-        decides.astype(np.int64), x, y, draw_grip(robot, rng), body, commands, tracks, pose, velocity,
+        decides.astype(np.int64), x, y, draw_grip(robot, rng), np.zeros((n, 2)) if slope is None else slope, body,
+        commands, tracks, pose, velocity,
     )  # fmt: skip
     travel = np.vstack([np.zeros(2), np.cumsum(tracks[:-1] * np.diff(t)[:, None], axis=0)])
     (command_left, command_right), (left, right) = commands.T.copy(), tracks.T.copy()

@@ -22,7 +22,7 @@ from icrtool import __version__
 from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icrs
+from icrtool.estimation.odometry import OdometryName, OdometryPath, drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.track import FrozenIcrs
@@ -34,7 +34,7 @@ from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import States
 from icrtool.records.text import distance_text
 
-PathName = Literal["filter", "smoothed", "icr", "no_slip"]
+PathName = Literal["filter", "smoothed"] | OdometryName
 
 ERROR_HORIZON_M = 10.0
 """Distance after which open-loop errors are exported [m]."""
@@ -91,13 +91,14 @@ class Globe(NamedTuple):
 def paths_of(run: Run) -> tuple[ExportPath, ...]:
     """Return the paths of a run: filter, smoother where it has one, ICR odometry, no slip where b is known."""
     table = run.table
-    momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
+    icrs_of = odometry_icrs(table, run.track_width_m)
+    momentary = icrs_of.pop("icr_momentary")
     found: list[tuple[PathName, States | OdometryPath, FrozenIcrs, float]] = [("filter", table, momentary, 0.0)]
     if run.smoothed is not None:
         found.append(("smoothed", run.smoothed, momentary, 0.0))
-    for name, icrs in odometry_icrs(run).items():
+    for name, icrs in icrs_of.items():
         driven = drive_wheels(table, run.in_gap, icrs)
-        found.append((name, driven, FrozenIcrs.constant(*icrs), driven.end_error_m))
+        found.append((name, driven, icrs, driven.end_error_m))
     return tuple(
         ExportPath(name, table.stamp_ns, path.east_m, path.north_m, math.pi / 2 - path.heading_rad, icrs, end_error_m)
         for name, path, icrs, end_error_m in found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
-from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icrs
+from icrtool.estimation.odometry import OdometryName, OdometryPath, drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.series import places
@@ -54,8 +54,12 @@ SLIP_LOOK: style.Look = style.spot("none", 6.5, "D", style.FLOAT_COLOR) | {"mark
 REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
 """Marker of rejected fixes. Shape and luminance distinguish the markers of all classes."""
 
-ODOMETRIES = {"icr": (style.ICR, 3), "no_slip": (style.NO_SLIP_LINE, 2)}
-"""Pen and order of the paths that are computed from wheel speeds alone."""
+ODOMETRIES: dict[OdometryName, tuple[str, str, int]] = {
+    "icr": ("icr_final", "final ICRs", 3),
+    "icr_momentary": ("icr", "momentary", 2),
+    "no_slip": ("no_slip", "no slip", 1),
+}
+"""Row whose pen draws the path that is computed from wheel speeds alone, words for its ICRs, and its order."""
 
 MOST_STATES = 500_000
 """Largest number of states of a drawn path of wheels alone: every state of 1 h at 100 Hz, one in 0.1 s of 10 h."""
@@ -63,10 +67,11 @@ MOST_STATES = 500_000
 
 @style.styled
 def trajectory(run: Run) -> Figure:
-    """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
+    """Return fixes, filter, and odometry with final ICRs, momentary ICRs and without slip, over east and north [m]."""
     table = run.table
     every = -(-len(table) // MOST_STATES)
-    paths = {name: drive_wheels(table, run.in_gap, icrs, every) for name, icrs in odometry_icrs(run).items()}
+    odometries = odometry_icrs(table, run.track_width_m)
+    paths = {name: drive_wheels(table, run.in_gap, icrs, every) for name, icrs in odometries.items()}
     low, high = _corners(table)
     detour = LARGEST_DETOUR * max(float((high - low).max()), SMALLEST_DRIVE_M)
     lows, highs = zip((low, high), *map(_corners, paths.values()), strict=True)
@@ -75,9 +80,8 @@ def trajectory(run: Run) -> Figure:
     )
     width_in = style.WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
-    ends = {"the final ICRs": run.document.odometry.icr, "no slip": run.document.odometry.no_slip}
-    off = [f"{distance_text(one.end_error_m)} off with {name}" for name, one in ends.items() if one is not None]
-    title = f"Wheels alone end {', '.join(off)}"
+    off = [f"{ODOMETRIES[name][1]} {distance_text(path.end_error_m)}" for name, path in paths.items()]
+    title = f"Wheels alone end off: {', '.join(off)}"
     subtitle = f"{run_title(run.document)}: {driven_text(run.document.drive)}"
     height_in = box_in + MARGINS_IN[2] + MARGINS_IN[3]
     figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=MARGINS_IN)
@@ -86,8 +90,10 @@ def trajectory(run: Run) -> Figure:
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, style.FILTER, label="filter", zorder=4)
+    pens = style.row_pens(row for row, *_ in ODOMETRIES.values())
     for name, path in paths.items():
-        (low, high), (pen, order) = _corners(path), ODOMETRIES[name]
+        (low, high), (row, _, order) = _corners(path), ODOMETRIES[name]
+        pen = pens[row]
         leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
         label = f"{PATH_WORDS[name]}, ends {distance_text(path.end_error_m)} off{leaves}"
         draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)

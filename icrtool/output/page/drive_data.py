@@ -220,8 +220,7 @@ def _odometry(run: Run, every: int, origin: tuple[float, float]) -> Paths:
     for model in models_of(run):
         if len(model.icrs.x_icr) > 1:
             continue
-        right, left, x = (float(column[0]) for column in model.icrs)
-        path = drive_wheels(run.table, run.in_gap, (right, left, x), every)
+        path = drive_wheels(run.table, run.in_gap, model.icrs, every)
         yield model.name, (path.heading_rad, path.north_m + 1j * path.east_m - complex(*origin))
 
 

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from msgspec import UNSET
 
 from icrtool.alignment.corrections import CORRECTION_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
@@ -324,8 +325,21 @@ def streams_section(summary: RunDocument) -> Section:
         names = (role_word(summary, stream.role), topics_text(stream.topic), message_type)
         streams.append((*names, rate, f"{stream.count:,}", stream.clock))
     head = ("stream", "topic", "type", "rate", "samples", "clock")
-    tables = [Table("lllrrl", streams, head), *_icr_tables(summary)]
+    tables = [Table("lllrrl", streams, head), *_icr_tables(summary), *_odometry_table(summary)]
     return Section("Streams, filter", [f"The robot drove at {speed}.", *tables], VERBOSE)
+
+
+def _odometry_table(summary: RunDocument) -> Iterator[Table]:
+    """Yield the errors of the paths by wheel speeds alone; nothing for a run of an earlier version."""
+    named = {"final ICRs": "icr", "momentary ICRs": "icr_momentary", "no slip": "no_slip"}
+    known = {words: getattr(summary.odometry, name) for words, name in named.items()}
+    rows = [
+        (words, *(error_text(metres) for metres in (one.mean_error_m, one.max_error_m, one.end_error_m)))
+        for words, one in known.items()
+        if one is not None and one is not UNSET and one.mean_error_m is not UNSET
+    ]
+    if rows:
+        yield Table("lrrr", rows, ("wheels alone, whole drive", "mean error", "largest", "at the end"))
 
 
 def _icr_tables(summary: RunDocument) -> Iterator[Table]:

@@ -16,6 +16,7 @@ import pytest
 from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import OutputError
+from icrtool.kernels.error_statistics import LEVEL, NEXT_LEVEL
 from icrtool.output.dropout_directory import (
     TRIALS_FILE,
     is_dropout_directory,
@@ -102,7 +103,8 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
         assert [row["trials"] for row in rows] == [row.trials for row in summary]
         assert [row["p95_m"] for row in rows] == [row.p95_m for row in summary]
     assert document["intervals"]["seed"] == content.document.intervals.seed
-    assert {"method", "level", "block"} <= document["intervals"].keys()
+    assert {"method", "block"} <= document["intervals"].keys()
+    assert (document["intervals"]["level"], document["intervals"]["next_level"]) == (LEVEL, NEXT_LEVEL)
     assert document["tolerance_m"] <= 1e-9
     assert document["run"]["inputs"] == json.loads(json_bytes({"x": run.summary["inputs"]}))["x"]
     assert [gate["passed"] for gate in document["gates"]] == [True, False, False]

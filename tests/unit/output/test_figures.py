@@ -9,7 +9,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from icrtool.estimation.odometry import drive_wheels
+from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.filter_records import GATED
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.calibrations import transfer
@@ -109,7 +109,7 @@ def texts_of(figure: Figure) -> list[mpl.text.Text]:
     return [text for text in found if text.get_text().strip()]
 
 
-def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: Run) -> None:
+def test_trajectory_shows_fixes_filter_and_every_odometry_square(run: Run) -> None:
     figure = drawn("trajectory", run)
     (axes,) = figure.axes
     texts = legend_texts(figure)
@@ -118,6 +118,7 @@ def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: Run) -> N
         f"GNSS fixes, {BAD_FIXES} rejected",
         "filter",
         "ICR odometry, ends",
+        "momentary-ICR odometry, ends",
         "no-slip odometry, ends",
         "start",
         "end",
@@ -127,7 +128,7 @@ def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: Run) -> N
     view = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
     path = line_labelled(axes, "filter")
     assert np.allclose(path[[0, -1]], np.column_stack([run.table.east_m, run.table.north_m])[[0, -1]])
-    path_end = drive_wheels(run.table, run.in_gap, run.table.icrs_at(-1))
+    path_end = drive_wheels(run.table, run.in_gap, odometry_icrs(run.table, None)["icr"])
     assert np.allclose(line_labelled(axes, "ICR odometry")[-1], [path_end.east_m[-1], path_end.north_m[-1]])
     for states, line in ((run.table.east_m, path[:, 0]), (run.table.north_m, path[:, 1])):
         assert abs(line.max() - states.max()) < CELL * view

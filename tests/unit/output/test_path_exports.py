@@ -18,7 +18,7 @@ from numpy.testing import assert_allclose
 
 from icrtool.calibration.run_models import models_of
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import drive_wheels
+from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import trial_ends
 from icrtool.output.exports.foxglove import BODIES, ERROR_HORIZON_M, WORLD, foxglove_layout, write_foxglove
@@ -174,7 +174,7 @@ def test_the_geojson_holds_states_fixes_events_and_outages(slipping: Run) -> Non
         layers.setdefault(feature["properties"]["layer"], []).append(feature)
     assert [line["properties"]["path"] for line in layers["path"]] == ["filter", "icr", "no_slip"]
     ends = [line["properties"]["end_error_m"] for line in layers["path"]]
-    driven = drive_wheels(slipping.table, slipping.in_gap, slipping.table.icrs_at(-1))
+    driven = drive_wheels(slipping.table, slipping.in_gap, odometry_icrs(slipping.table, None)["icr"])
     assert ends[1] == pytest.approx(driven.end_error_m)
     (outage,) = layers["outage"]
     assert outage["properties"]["duration_s"] == pytest.approx(OUTAGE_S[1] - OUTAGE_S[0], abs=0.2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.errors import ConfigError
-from icrtool.kernels.friction import SlidingBody, slide
+from icrtool.kernels.friction import ROLLING_MPS, SlidingBody, slide
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, simulate
 from icrtool.simulation.friction import TRACKED_ROBOT, FrictionRobot, draw_grip, fitted_icrs, scaled_robot, slide_path
 from icrtool.simulation.truths import FrictionTruth
@@ -82,19 +82,58 @@ def test_the_step_of_the_grid_changes_nothing() -> None:
     np.testing.assert_allclose(coarse.poses(np.array([9.0])), fine.poses(np.array([9.0])), atol=1e-3)
 
 
+@pytest.mark.parametrize("slope", [(0.02, 0.0), (0.0, 0.02)])
+def test_on_a_slope_a_standing_robot_creeps_as_fast_as_its_friction_lets_it(slope: tuple[float, float]) -> None:
+    """Closed form: mu v / sqrt(v^2 + s0^2) is the slope, with s0 the sliding speed of 0.7 of the friction."""
+    t, n = np.arange(600) * 0.01, 600
+    velocity = slide_path(
+        EVEN, t, np.zeros(n), np.zeros(n), np.full(n, True), (0.5, -0.5, 0.0), start_heading_rad=0.0, lag_s=0.0,
+        rng=np.random.default_rng(0), slope=np.tile(slope, (n, 1)), steers=False,
+    ).velocity[-1, :2]  # fmt: skip
+    share = 0.02 / EVEN.friction
+    expected = EVEN.slip_mps * share / np.sqrt(1.0 - share**2)
+    np.testing.assert_allclose(velocity, expected * np.array(slope) / 0.02, rtol=1e-3, atol=1e-9)
+
+
+def test_rolling_resistance_slows_the_robot_below_its_wheels() -> None:
+    """Closed form: at a steady speed friction along the wheels equals the rolling resistance."""
+    t, n, robot = np.arange(600) * 0.01, 600, replace(EVEN, resistance=0.05)
+    speed = slide_path(
+        robot, t, np.full(n, 0.5), np.zeros(n), np.full(n, True), (0.5, -0.5, 0.0), start_heading_rad=0.0, lag_s=0.0,
+        rng=np.random.default_rng(0), steers=False,
+    ).velocity[-1, 0]  # fmt: skip
+    share = robot.resistance / robot.friction * speed / np.hypot(speed, ROLLING_MPS)
+    assert 0.5 - speed == pytest.approx(robot.slip_mps * share / np.sqrt(1.0 - share**2), rel=1e-3)
+
+
+def test_a_mass_right_of_the_middle_mirrors_a_mass_left_of_it() -> None:
+    t, n, height = np.arange(2000) * 0.01, 2000, replace(EVEN, mass_height_m=0.2, resistance=0.05)
+
+    def pose(mass_right_m: float, turn: float) -> np.ndarray:
+        return slide_path(
+            replace(height, mass_right_m=mass_right_m), t, np.full(n, 0.5), np.full(n, turn), np.full(n, True),
+            (0.5, -0.5, 0.0), start_heading_rad=0.0, lag_s=0.0, rng=np.random.default_rng(0), steers=False,
+        ).pose  # fmt: skip
+
+    right, mirrored, other = pose(0.05, 0.3), pose(-0.05, -0.3), pose(-0.05, 0.3)
+    np.testing.assert_allclose(right[:, 0], mirrored[:, 0], atol=1e-9)
+    np.testing.assert_allclose(right[:, 1:], -mirrored[:, 1:], atol=1e-9)
+    assert np.hypot(*(right - other)[-1, :2]) > 0.01  # the place of the mass matters
+
+
 def test_the_compiled_motion_is_that_of_python() -> None:
     truth = driven(FrictionRobot(), "curved", speed=0.8, seconds=0.5)
     robot, n = FrictionRobot(), 40
     t = truth.t_s[:n]
-    body = SlidingBody(118.0, 10.0, 0.05, 0.3, 0.03, 2.0, 0.1, 0.5, 0.5, -0.5, 0.1)
+    body = SlidingBody(118.0, 10.0, 0.05, 0.02, 0.3, 0.02, 0.03, 2.0, 0.03, 0.1, 0.5, 2.0, 0.5, -0.5, 0.1)
     x, y = np.array(robot.contact_forward_m * 2), np.repeat([0.305, -0.305], 2)
     grip = draw_grip(robot, np.random.default_rng(3))[:100]
     results = []
     for function in (slide, slide.py_func):
         commands, tracks, pose, velocity = (np.zeros((n, columns)) for columns in (2, 2, 3, 3))
         function(
-            t, np.full(n, 0.8), np.full(n, 0.5), 0.5 * t, np.ones(n, np.int64), x, y, grip, body, commands, tracks,
-            pose, velocity,
+            t, np.full(n, 0.8), np.full(n, 0.5), 0.5 * t, np.ones(n, np.int64), x, y, grip, np.full((n, 2), 0.01), body,
+            commands, tracks, pose, velocity,
         )  # fmt: skip
         results.append(np.column_stack([commands, tracks, pose, velocity]))
     np.testing.assert_allclose(results[0], results[1], rtol=1e-9, atol=1e-12)
