@@ -23,6 +23,7 @@ from icrtool.alignment.sensor_noise import (
     without_frozen,
 )
 from icrtool.alignment.slip_events import find_disagreements
+from icrtool.alignment.sparse_reference import without_interpolated
 from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
@@ -52,6 +53,8 @@ def align(log: RobotLog, config: Config) -> Measurements:
     DataError
         Streams that cannot be used together, or a heading without any relation to the course over ground.
     """
+    if config.filter.rules.corrects:
+        log = without_interpolated(log)
     log = with_wheel_speeds(log, config)
     if not config.filter.rules.corrects:
         # it takes its wheels as they are

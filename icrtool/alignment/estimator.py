@@ -165,7 +165,7 @@ class AlignmentFit(NamedTuple):
         """Robust scatter of the displacements along and across the heading beyond the fixes' noise, over the length."""
         noise2 = 2.0 * self.windows.track.place_std_m**2
         beyond = np.maximum(self.fit.scale[[0, len(self.windows.begin)]] ** 2 - noise2, 0.0)
-        along, across = (np.sqrt(beyond) / self.windows.length_m[0]).tolist()
+        along, across = (np.sqrt(beyond) / self.windows.usual_length_m).tolist()
         return along, across
 
     @property
@@ -183,8 +183,14 @@ class AlignmentFit(NamedTuple):
 
     @property
     def slips(self) -> bool:
-        """Whether the wheels slip too much to show a scale or a delay."""
-        return self.scatter[0] > SLIPPING or self.turn_slip > TURNS_SLIPPING
+        """Whether the wheels slip too much to show a scale or a delay.
+
+        Where headings are rare, the windows are few, and their scatter must be larger by two standard deviations.
+        """
+        few = 0.0
+        if self.windows.track.measured_t is not None:
+            few = 2.0 / math.sqrt(2.0 * len(np.unique(self.windows.group)))
+        return self.scatter[0] * (1.0 - few) > SLIPPING or self.turn_slip * (1.0 - few) > TURNS_SLIPPING
 
     def geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs about the antenna, multiplier and side scales, and their covariance (6, 6)."""
@@ -214,8 +220,12 @@ def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
 
 
 def _clock_std_s(track: Track, width_m: float) -> float:
-    """Return the standard deviation of the time between position and heading that no drive shows [s]."""
-    return RESPONSE_STD_S if track.same_clock else max(CLOCK_S_PER_M * width_m, RESPONSE_STD_S)
+    """Return the standard deviation of the time between position and heading that no drive shows [s].
+
+    A heading that the wheels carry turns at once; the body turns after its response, which is not known.
+    """
+    std = RESPONSE_STD_S if track.same_clock else max(CLOCK_S_PER_M * width_m, RESPONSE_STD_S)
+    return std if track.measured_t is None else math.hypot(std, RESPONSE_STD_S)
 
 
 def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.estimator import AlignmentFit
+from icrtool.alignment.sparse_reference import spans_of_measured
 from icrtool.kernels.arrays import Floats, Ints
 
 CHANGE_WINDOW_S, CHANGE_GROUP_S = 2.0, 10.0
@@ -61,16 +62,18 @@ def find_change(fit: AlignmentFit) -> GroundChange | None:
     """
     track, delay = fit.windows.track, fit.estimate("heading_delay")[0]
     turned = track.cumulate(2.0 * track.half_difference / fit.width_m)
-    begin = np.arange(
-        max(track.t[0] + delay, track.heading_t[0]),
-        min(track.t[-1] + delay, track.heading_t[-1]) - CHANGE_WINDOW_S,
-        CHANGE_WINDOW_S / 2,
-    )
+    first, last = max(track.t[0] + delay, track.heading_t[0]), min(track.t[-1] + delay, track.heading_t[-1])
+    begin = np.arange(first, last - CHANGE_WINDOW_S, CHANGE_WINDOW_S / 2)
+    end = begin + CHANGE_WINDOW_S
+    if track.measured_t is not None:
+        begin, end = spans_of_measured(track.measured_t, CHANGE_WINDOW_S, 2)
+        inside = (begin >= first) & (end <= last) & (end - begin < CHANGE_GROUP_S)
+        begin, end = begin[inside], end[inside]
     if len(begin) < 4 * FEWEST_CHANGE_GROUPS:
         return None
-    x = np.interp(begin + CHANGE_WINDOW_S - delay, track.t, turned) - np.interp(begin - delay, track.t, turned)
-    y = track.heading_at(begin + CHANGE_WINDOW_S) - track.heading_at(begin)
-    kept = track.clear(begin - delay, begin + CHANGE_WINDOW_S - delay)
+    x = np.interp(end - delay, track.t, turned) - np.interp(begin - delay, track.t, turned)
+    y = track.heading_at(end) - track.heading_at(begin)
+    kept = track.clear(begin - delay, end - delay)
     begin, x, y = begin[kept], x[kept], y[kept]
     group = np.floor(begin / CHANGE_GROUP_S).astype(np.int64)
     weight = np.cumsum(x**2)

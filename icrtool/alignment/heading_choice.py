@@ -197,7 +197,7 @@ def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: 
     if derived.gyro is None:
         return False
     t = (derived.gyro.stamp_ns - int(log.wheels.stamp_ns[0])) / 1e9
-    by_gyro = track._replace(heading_t=t, heading=trapezoids(t, derived.gyro.rate_radps))
+    by_gyro = track._replace(heading_t=t, heading=trapezoids(t, derived.gyro.rate_radps), measured_t=None)
     return any(
         found.left_rad < LEFT_SHARE * found.turn_rad and LEAST_GAIN < found.ratio < LARGEST_GAIN
         for found in compare_turns(by_gyro, width_m, 0.0, (TURNS_COMPARED_S,))
@@ -234,7 +234,8 @@ def _derived(
     epoch, absolute = int(log.wheels.stamp_ns[0]), list[AbsoluteHeading]()
     if stated is not None:
         # with the white noise that it shows relative to the turn rate
-        one = _averaged(track.heading_t, track.heading, turn, ATTITUDE_CELL_S)
+        measured = track.seen_heading_t
+        one = _averaged(measured, track.heading_at(measured), turn, ATTITUDE_CELL_S)
         step = np.diff(one.heading - np.interp(one.t, turn.t, turn.integrated))
         noise = mad_std(wrapped(step - np.median(step))) / math.sqrt(2.0) if len(step) else 0.0
         std = np.full(len(one.t), max(noise, LEAST_ATTITUDE_STD_RAD))

@@ -15,6 +15,7 @@ from icrtool.alignment.sensor_noise import (
     USUAL_POSITION_STD_M,
     unbroken,
 )
+from icrtool.alignment.sparse_reference import carried, spans_of_measured
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, in_spans, runs_of, unwrapped
 from icrtool.kernels.track import Track, Windows, cut
@@ -79,6 +80,11 @@ class DriveWindows(Windows):
         return self.over(self.track.laid)
 
     @cached_property
+    def usual_length_m(self) -> float:
+        """Usual distance of a window [m]. Where fixes are rare it is more than the nominal length."""
+        return float(np.median(self.over(self.track.distance)))
+
+    @cached_property
     def heading_changes(self) -> Floats:
         """Turn of the heading in each window of time (u,) [rad]."""
         begin, end = self.track.heading_at(np.stack([self.turn_begin, self.turn_end]))
@@ -124,7 +130,7 @@ def track_of_streams(
         begins = (held == 0.0) | np.append(True, held[:-1] == 0.0)
         begins[_thinned(turns)] = begins[-1] = True
         track = track.joined(np.flatnonzero(begins))
-    return track._replace(distance=np.interp(fix_t, track.t, track.travel))
+    return carried(track._replace(distance=np.interp(fix_t, track.t, track.travel)))
 
 
 def _thinned(busy: Bools) -> Ints:
@@ -178,7 +184,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
     moving = np.diff(travel) > 0
     changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
     lasts_m = float(travel[-1]) / max(sum(changes) / 2, 1.0)
-    length = length_m or max(least_m, noise, min(WINDOW_IN_VALUES * lasts_m, LONGEST_WINDOW_M))
+    length = length_m or max(least_m, noise, min(WINDOW_IN_VALUES * lasts_m, LONGEST_WINDOW_M), _apart_m(track))
     windows = cut(track, [length], length / STARTS_A_WINDOW)
     begin, end = windows.begin, windows.end
     covers = [track.t, track.heading_t] if len(track.heading_t) else [track.t]
@@ -189,13 +195,18 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
     begin, end, lengths = begin[whole], end[whole], windows.length_m[whole]
     # windows of time in which wheels and heading were sampled and the wheels turned
     turn_begin = turn_end = np.empty(0)
-    sampled = track.heading_t
+    sampled = track.seen_heading_t
     if len(sampled):
         usual = float(np.median(np.diff(sampled))) if len(sampled) > 1 else 0.0
-        turn_begin = sampled[0] + TURN_WINDOW_EVERY_S * np.unique(
-            np.floor((sampled - sampled[0]) / TURN_WINDOW_EVERY_S)
-        )
-        turn_end = turn_begin + max(TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS * usual)
+        if track.measured_t is None:
+            turn_begin = sampled[0] + TURN_WINDOW_EVERY_S * np.unique(
+                np.floor((sampled - sampled[0]) / TURN_WINDOW_EVERY_S)
+            )
+            turn_end = turn_begin + max(TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS * usual)
+        else:
+            turn_begin, turn_end = spans_of_measured(sampled, TURN_WINDOW_S, round(TURN_WINDOW_IN_INTERVALS))
+            near = turn_end - turn_begin < LONGEST_ALIGNMENT_WINDOW_S
+            turn_begin, turn_end = turn_begin[near], turn_end[near]
         whole = (turn_begin >= first) & (turn_end <= last) & track.clear(turn_begin, turn_end)
         whole &= np.searchsorted(sampled, turn_end) > np.searchsorted(sampled, turn_begin) + 1
         whole &= np.interp(turn_end, track.t, travel) > np.interp(turn_begin, track.t, travel)
@@ -209,15 +220,31 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
     )  # fmt: skip
 
 
+APART_SHARE = 0.9
+"""Quantile of the distances from fix to fix that a window is at least as long as."""
+
+
+def _apart_m(track: Track) -> float:
+    """Return the usual largest distance from one fix to the next while the robot moves [m]; 0 without two fixes."""
+    step = np.diff(track.distance)
+    step = step[step > 0.0]
+    return float(np.quantile(step, APART_SHARE)) if len(step) else 0.0
+
+
+def chord_s(track: Track) -> float:
+    """Return the duration of a chord [s]: `CHORD_S`, or the usual interval between fixes that are rarer."""
+    return max(CHORD_S, float(np.median(np.diff(track.place_t)))) if len(track.place_t) > 1 else CHORD_S
+
+
 def cut_chords(track: Track) -> tuple[Floats, Complexes, Floats, Floats]:
-    """Cut a drive into spans of `CHORD_S` from fix to fix, without a heading.
+    """Cut a drive into spans of `chord_s` from fix to fix, without a heading.
 
     Returns
     -------
     duration (w,) [s]; displacement of the fixes, north + j east; distance of the left and of the right side, with their
     signs [m]
     """
-    rows = np.unique(np.floor(track.place_t / CHORD_S), return_index=True)[1]
+    rows = np.unique(np.floor(track.place_t / chord_s(track) + 1e-9), return_index=True)[1]
     left, right = (np.diff(track.at_places(speed)[rows]) for speed in (track.v_left, track.v_right))
     return np.diff(track.place_t[rows]), np.diff(track.place[rows]), left, right
 

@@ -183,7 +183,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         for gone in (track.cumulate(left), track.cumulate(right))
     )
     heading = track.heading_at(t)
-    of_wheels, *of_others = (_in_hole(sampled, t) for sampled in (track.t, track.heading_t, t))
+    of_wheels, *of_others = (_in_hole(sampled, t) for sampled in (track.t, track.seen_heading_t, t))
     gyro, by_gyro = sensors.gyro, None
     if gyro is not None and len(gyro.stamp_ns) >= FEWEST_FIXES:
         at = (gyro.stamp_ns - wheels.stamp_ns[0]) / 1e9

@@ -18,6 +18,7 @@ from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit, residuals
 from icrtool.alignment.ground_change import find_change
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken
+from icrtool.alignment.sparse_reference import spans_of_measured
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, rows_at_steps, unwrapped
 from icrtool.kernels.robust import robust_regression, sandwich_covariance
@@ -309,20 +310,26 @@ def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Seque
     t, travel, found = track.t, track.travel, list[Turns]()
     turned = track.cumulate(2.0 * track.half_difference / width_m)
     for window_s in windows_s:
-        first = max(t[0] + delay_s, track.heading_t[0])
-        last = min(t[-1] + delay_s, track.heading_t[-1]) - window_s
-        begin = np.arange(first, last, window_s / STARTS_A_SPAN)
+        first, last = max(t[0] + delay_s, track.heading_t[0]), min(t[-1] + delay_s, track.heading_t[-1])
+        if track.measured_t is None:
+            begin = np.arange(first, last - window_s, window_s / STARTS_A_SPAN)
+            end, a_span = begin + window_s, np.arange(len(begin)) // STARTS_A_SPAN
+        else:
+            begin, end = spans_of_measured(track.measured_t, window_s, 1)
+            inside = (begin >= first) & (end <= last) & (end - begin < 2.0 * window_s)
+            begin, end = begin[inside], end[inside]
+            a_span = np.floor((begin - first) / window_s).astype(np.int64)
         by_wheels, by_heading = (
-            np.interp(begin + window_s - shift, times, angle) - np.interp(begin - shift, times, angle)
+            np.interp(end - shift, times, angle) - np.interp(begin - shift, times, angle)
             for shift, times, angle in ((delay_s, t, turned), (0.0, track.heading_t, track.heading))
         )
-        moved = np.interp(begin + window_s - delay_s, t, travel) > np.interp(begin - delay_s, t, travel)
-        kept = np.flatnonzero(track.clear(begin - delay_s, begin + window_s - delay_s) & moved)
+        moved = np.interp(end - delay_s, t, travel) > np.interp(begin - delay_s, t, travel)
+        kept = np.flatnonzero(track.clear(begin - delay_s, end - delay_s) & moved)
         by_wheels, by_heading = by_wheels[kept], by_heading[kept]
-        if len(kept) < STARTS_A_SPAN * FEWEST_SPANS or not by_wheels.any():
+        if len(np.unique(a_span[kept])) < FEWEST_SPANS or not by_wheels.any():
             return []
         fit = robust_regression(by_wheels[:, None], by_heading)
-        variance = sandwich_covariance(fit, kept // STARTS_A_SPAN)[0, 0]
+        variance = sandwich_covariance(fit, a_span[kept])[0, 0]
         turn = math.sqrt(float(np.mean(by_heading**2)))
         found.append(Turns(float(fit.x[0]), math.sqrt(float(variance)), float(fit.scale[0]), turn))
     return found
@@ -333,6 +340,10 @@ NOISE_S, SHORT_S, MIDDLE_S, LONGEST_S = 0.3, 1.0, 5.0, 40.0
 
 SHORTEST_LONG_S, LONG_WINDOWS = 15.0, 8.0
 """Shortest duration of the long windows [s], and number of long windows in a drive."""
+
+RESOLVED_INTERVALS, MIDDLE_IN_SHORT = 2.0, 2.5
+"""Shortest times over which turns are compared where headings are rare: in intervals between headings, and for the
+middle one in the short one."""
 
 SMALLEST_CHANGE = 0.1
 """Smallest significant change of the ratio of turn to wheels' turn from short to long windows."""
@@ -356,17 +367,24 @@ def find_filtering(fit: AlignmentFit) -> str:
     long_s = min(LONGEST_S, float(track.t[-1]) / LONG_WINDOWS)
     if long_s < SHORTEST_LONG_S:
         return ""
-    found = compare_turns(track, fit.width_m, delay, (NOISE_S, SHORT_S, MIDDLE_S, long_s))
+    measured = track.seen_heading_t
+    resolved_s = RESOLVED_INTERVALS * float(np.median(np.diff(measured))) if track.measured_t is not None else 0.0
+    noise_s, short_s = max(NOISE_S, resolved_s), max(SHORT_S, resolved_s)
+    middle_s = max(MIDDLE_S, MIDDLE_IN_SHORT * short_s) if track.measured_t is not None else MIDDLE_S
+    if long_s < SHORTEST_LONG_S / MIDDLE_S * middle_s:
+        # the reference does not resolve the turns of a filter
+        return ""
+    found = compare_turns(track, fit.width_m, delay, (noise_s, short_s, middle_s, long_s))
     if not found:
         return ""
     noise, short, middle, long = found
     change, std = long.ratio - short.ratio, math.hypot(short.ratio_std, long.ratio_std)
     if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(EVIDENCE_SIGMAS * std, SMALLEST_CHANGE * long.ratio):
-        ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {SHORT_S:g} s and {long.ratio:.2f} ± "
+        ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {short_s:g} s and {long.ratio:.2f} ± "
         return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of what they show"
     at_middle, at_end = (math.sqrt(max(one.left_rad**2 - noise.left_rad**2, 0.0)) for one in (middle, long))
     least = max(LARGE_SHARE * short.turn_rad, LARGE_RAD)
     if at_middle > least and at_end < BOUNDED * at_middle:
-        angles = f"{math.degrees(at_middle):.0f}° over {MIDDLE_S:g} s and by no more than {math.degrees(at_end):.0f}°"
+        angles = f"{math.degrees(at_middle):.0f}° over {middle_s:g} s and by no more than {math.degrees(at_end):.0f}°"
         return f"their turn differs from the robot's by {angles} over {long_s:.0f} s, which slip would add up"
     return ""

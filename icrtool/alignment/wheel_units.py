@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.log_track import (
-    CHORD_S,
     FEWEST_ALIGNMENT_WINDOWS,
     LEAST_CHORD_M,
     DriveWindows,
+    chord_s,
     cut_chords,
     track_of_streams,
 )
@@ -197,7 +197,7 @@ def _spikes(speed: Floats) -> Bools:
 
 
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
-    """Compare distances by reference and wheels over `CHORD_S`; None where there are too few spans.
+    """Compare distances by reference and wheels over `chord_s`; None where there are too few spans.
 
     Notes
     -----
@@ -208,10 +208,10 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     if min(len(stamps), len(gnss.stamp_ns)) < 2:
         return None
     track = track_of_streams(WheelSamples(stamps, left, right), gnss, NO_HEADINGS, same_clock=False)
-    duration, step, left, right = cut_chords(track)
+    usual_s, (duration, step, left, right) = chord_s(track), cut_chords(track)
     left, right, chord = np.abs(left), np.abs(right), np.abs(step)
     distance, turn = (left + right) / 2, np.abs(left - right)
-    usable = (np.abs(duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_CHORD_M) & (distance > 0)
+    usable = (np.abs(duration - usual_s) < usual_s / 4) & (chord > LEAST_CHORD_M) & (distance > 0)
     straight = usable & (turn < STRAIGHT * distance)
     if np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:
         bend = np.full(len(chord), np.inf)

@@ -42,6 +42,7 @@ class Track(NamedTuple):
         samples
     place_std_m : standard deviation of the positions on each axis [m]; 0 where it is not needed
     same_clock : position and heading are fields of the same messages
+    measured_t : (k,) times of measured headings, where the wheels carry them in between; None: each one is measured
     """
 
     t: Floats
@@ -61,6 +62,7 @@ class Track(NamedTuple):
     into: float = 0.0
     place_std_m: float = 0.0
     same_clock: bool = True
+    measured_t: Floats | None = None
 
     @classmethod
     def of_states(
@@ -125,6 +127,11 @@ class Track(NamedTuple):
     def heading_at(self, t: Floats) -> Floats:
         """Return the heading at some times."""
         return np.interp(t, self.heading_t, self.heading)
+
+    @property
+    def seen_heading_t(self) -> Floats:
+        """Times of the measured headings [s]."""
+        return self.heading_t if self.measured_t is None else self.measured_t
 
     def clear(self, begin_s: Floats, end_s: Floats) -> Bools:
         """Return which spans of time (w,) hold no gap in the wheel data."""

@@ -293,6 +293,12 @@ OF_WHEELS: dict[str, Explanation] = {
 """Codes of what was found of the wheels."""
 
 OF_POSITIONS: dict[str, Explanation] = {
+    "positions_interpolated": Explanation(
+        "warning",
+        "The positions lie on straight lines between nodes, also where the robot turns: a program interpolated them.",
+        "The nodes alone are used; the reference is unknown between them.",
+        "Record the positions as they are measured, or more nodes.",
+    ),
     "first_fixes_apart": Explanation(
         "warning",
         "The first fixes lie further from the others than the robot can drive.",

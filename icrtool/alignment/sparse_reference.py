@@ -1,0 +1,175 @@
+"""References with few poses: headings carried between their samples by the wheels, and nodes of interpolated poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from icrtool.alignment.sensor_noise import is_hole
+from icrtool.kernels.arrays import Bools, Floats, Ints, wrapped
+from icrtool.kernels.track import Track
+from icrtool.records.notes import note
+from icrtool.records.samples import HeadingSamples
+from icrtool.records.tables import RobotLog
+
+SPARSE_S = 0.5
+"""Usual interval between headings above which they are carried by the wheels [s]. Turns are compared over 1 s, which a
+rarer heading does not resolve by itself."""
+
+LONGEST_CARRIED_S = 30.0
+"""Longest interval in which the wheels carry a heading [s]. A longer one holds a stop or an outage."""
+
+FEWEST_CARRIED = 8
+"""Smallest number of intervals from which the ratio of turn to the difference of the sides is taken."""
+
+LARGEST_TURN_PER_M = 7.0
+"""Largest turn of a robot per metre by which its sides differ [rad/m], of a robot with ICRs 0.14 m apart."""
+
+AGREED_COSINE = 0.7
+"""Smallest mean cosine of the differences of the turns at which wheels carry a heading. It is 0 for turns of any size,
+and 0.7 for errors of 48 deg (rms)."""
+
+
+def carried(track: Track) -> Track:
+    """Return the track with a heading at each wheel sample where its headings are rare; else the same track.
+
+    Notes
+    -----
+    Between two measured headings the heading follows the wheels' turn, times one ratio of the whole drive; what is then
+    left at the measured headings is interpolated. The ratio maximises the mean cosine of the differences, as a turn
+    between two headings may be more than half a revolution (Fisher and Lee 1992, circular regression).
+    `Track.measured_t` holds the times of the measured headings.
+    """
+    t, heading = track.heading_t, track.heading
+    step = np.diff(t)
+    if len(step) < FEWEST_CARRIED or not float(np.median(step)) > SPARSE_S:
+        return track
+    turned = np.interp(t, track.t, track.cumulate(2.0 * track.half_difference))
+    whole = (step < LONGEST_CARRIED_S) & (step > 0.0) & track.clear(t[:-1], t[1:])
+    apart, turn = np.diff(turned), wrapped(np.diff(heading))
+    ratio = _turn_per_m(apart[whole], turn[whole])
+    if ratio is None:
+        return track
+    left = heading[0] + np.append(0.0, np.cumsum(np.where(whole, wrapped(turn - ratio * apart), turn - ratio * apart)))
+    inside = track.t[(track.t > t[0]) & (track.t < t[-1])]
+    dense = np.union1d(t, inside)
+    everywhere = np.interp(dense, track.t, track.cumulate(2.0 * track.half_difference)) - turned[0]
+    return track._replace(heading_t=dense, heading=np.interp(dense, t, left) + ratio * everywhere, measured_t=t)
+
+
+def _turn_per_m(apart: Floats, turn: Floats) -> float | None:
+    """Return turn per metre by which the sides differ [rad/m]; None where the wheels do not explain the turns."""
+    largest = float(np.abs(apart).max(initial=0.0))
+    if len(apart) < FEWEST_CARRIED or largest <= 0.0:
+        return None
+    tried = np.arange(-LARGEST_TURN_PER_M, LARGEST_TURN_PER_M, min(0.5 / largest, 0.1))
+    score = np.array([float(np.cos(turn - ratio * apart).mean()) for ratio in tried.tolist()])
+    best = float(tried[int(np.argmax(score))])
+    if score.max() < AGREED_COSINE:
+        return None
+    return best + float(apart @ wrapped(turn - best * apart)) / float(apart @ apart)
+
+
+def spans_of_measured(measured_t: Floats, least_s: float, intervals: int) -> tuple[Floats, Floats]:
+    """Return begins and ends (w,) [s] of spans from one measured heading to another.
+
+    Parameters
+    ----------
+    least_s : shortest span [s]; intervals : smallest number of intervals in a span
+    """
+    begin = np.arange(len(measured_t))
+    end = np.maximum(begin + intervals, np.searchsorted(measured_t, measured_t + least_s - 1e-9))
+    kept = end < len(measured_t)
+    return measured_t[begin[kept]], measured_t[end[kept]]
+
+
+LINE_SHARE, LINE_M, LINE_RAD = 1e-4, 2e-6, 2e-6
+"""Largest second difference of a sample that lies on the line between its neighbours: as a share of the step, and in
+metres and radians, by which stamps in microseconds and coordinates are rounded."""
+
+CURVE_SHARE = 0.1
+"""Difference of the sides, as a share of their sum, from which on a robot drives a curve."""
+
+INTERPOLATED_SHARE = 0.6
+"""Share of the positions in curves that lie on lines, from which on the positions are interpolated. No robot drives a
+curve in a straight line; of every third position that was measured, two thirds lie on lines."""
+
+FEWEST_IN_CURVES = 20
+"""Smallest number of positions in curves by which positions are called interpolated."""
+
+
+def without_interpolated(log: RobotLog) -> RobotLog:
+    """Return the log with the nodes of positions that are linear between nodes; the same log where none are.
+
+    Positions between the nodes are no measurements. A heading is reduced to its nodes where it is linear as well.
+    """
+    fixes, wheels = log.gnss, log.wheels
+    stamps = fixes.stamp_ns
+    if len(stamps) < FEWEST_IN_CURVES or len(wheels.stamp_ns) < 2:
+        return log
+    t, place = (stamps - stamps[0]) / 1e9, fixes.north_m + 1j * fixes.east_m
+    bend, step = _bends(t, place)
+    straight = bend <= LINE_SHARE * step + LINE_M
+    row = np.clip(np.searchsorted(wheels.stamp_ns, stamps, side="right") - 1, 0, len(wheels.stamp_ns) - 1)
+    left, right = wheels.left[row], wheels.right[row]
+    curves = np.abs(left - right) > CURVE_SHARE * (np.abs(left) + np.abs(right))
+    curves &= step > 10.0 * LINE_M
+    if np.count_nonzero(curves) < FEWEST_IN_CURVES or float(straight[curves].mean()) < INTERPOLATED_SHARE:
+        return log
+    heading = log.heading
+    alike = log.heading_is_of_position and np.array_equal(heading.stamp_ns, stamps)
+    turn_straight, turn_bend, turns = _straight_turns(heading)
+    if turns and alike:
+        straight, bend = straight & turn_straight, bend + turn_bend
+    kept = _nodes(~straight, bend)
+    apart_s = float(np.median(np.diff(t[kept])))
+    why = (
+        f"the positions are interpolated: they lie on straight lines between nodes {apart_s:.2g} s apart, also where "
+        f"the robot turns; the {len(kept)} nodes of {len(stamps)} positions are used"
+    )
+    rows = np.zeros(len(stamps), np.bool_)
+    rows[kept] = True
+    found = note("positions_interpolated", why, log.name)
+    if alike:
+        heading = heading.cut(rows)
+    elif turns:
+        rows_of_heading = np.zeros(len(turn_straight), np.bool_)
+        rows_of_heading[_nodes(~turn_straight, turn_bend)] = True
+        heading = heading.cut(rows_of_heading)
+    return replace(log, gnss=fixes.cut(rows), heading=heading, notes=(*log.notes, found))
+
+
+def _straight_turns(heading: HeadingSamples) -> tuple[Bools, Floats, bool]:
+    """Return which headings (n,) lie on the line between their neighbours, how far off, and whether most turns do."""
+    if len(heading.stamp_ns) < FEWEST_IN_CURVES:
+        return np.zeros(len(heading.stamp_ns), np.bool_), np.zeros(len(heading.stamp_ns)), False
+    bend, step = _bends((heading.stamp_ns - heading.stamp_ns[0]) / 1e9, np.unwrap(heading.heading_rad))
+    straight, turning = bend <= LINE_SHARE * step + LINE_RAD, step > 10.0 * LINE_RAD
+    many = np.count_nonzero(turning) >= FEWEST_IN_CURVES
+    return straight, bend, bool(many and straight[turning].mean() > INTERPOLATED_SHARE)
+
+
+def _bends(t: Floats, value: Floats) -> tuple[Floats, Floats]:
+    """Return how far each sample (n,) lies from the line between its neighbours, and half of their distance.
+
+    The first and the last sample, and samples at a hole, are far from any line.
+    """
+    before, after = np.diff(t)[:-1], np.diff(t)[1:]
+    share = before / np.maximum(before + after, 1e-12)
+    line = value[:-2] + share * (value[2:] - value[:-2])
+    far = np.full(len(t), np.inf)
+    far[1:-1] = np.where((before > 0.0) & (after > 0.0), np.abs(value[1:-1] - line), 0.0)
+    hole = is_hole(np.diff(t))
+    far[:-1][hole] = far[1:][hole] = np.inf
+    half = np.zeros(len(t))
+    half[1:-1] = np.abs(value[2:] - value[:-2]) / 2.0
+    return far, half
+
+
+def _nodes(bent: Bools, bend: Floats) -> Ints:
+    """Return rows of the nodes: of neighbours that are bent, as where no sample is a node itself, the most bent one."""
+    rows = np.flatnonzero(bent)
+    first = np.append(True, np.diff(rows) > 1)
+    kept = [run[int(np.argmax(bend[run]))] for run in np.split(rows, np.flatnonzero(first)[1:])]
+    return np.asarray(kept, np.int64)
