@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 from msgspec.structs import asdict, astuple, replace
 
 from icrtool import __version__
@@ -395,7 +396,36 @@ def best_row(
         half = difference_half_width(*sums, "expected", 1.0, paired=True)
         if (worse := float(means[name][h]) - least) <= 0.0 or worse <= half:
             as_good.append(name)
-    return documents.BestRow(best, float(errors.horizons_m[h]), least, tuple(as_good))
+    heading = start_heading(results[best], h, errors.run_document.heading.source)
+    return documents.BestRow(best, float(errors.horizons_m[h]), least, tuple(as_good), heading)
+
+
+HALF_OF_SQUARE = math.sqrt(0.5)
+"""Ratio of two errors of which one has half of the square of the other: independent parts of an error add in
+squares."""
+
+ESTIMATED_HEADINGS = ("gyro_course", "wheels_course")
+"""Sources of a heading that no sensor measures."""
+
+
+def start_heading(result: documents.ModelResult, h: int, source: str) -> documents.StartHeading | UnsetType:
+    """Return what the headings at the start of trials cost at horizon number `h`; unset where that is not known.
+
+    Parameters
+    ----------
+    source : of the heading, as in run.json
+    """
+    aligned = result.aligned[h] if result.aligned else None
+    if aligned is None:
+        return UNSET
+    expected, p95 = (float(result.column(name)[h]) for name in ("expected_error_m", "p95_m"))
+    half = difference_half_width(aligned.sums, result.block_sums[h], "p95", HALF_OF_SQUARE, paired=True)
+    dominates = aligned.p95_m - HALF_OF_SQUARE * p95 + half < 0.0
+    mend = "check the heading sensor's mounting and calibration"
+    if source in ESTIMATED_HEADINGS:
+        mend = "mount an AHRS or a second antenna"
+    mend = f"{mend}, or drive straight for some metres before GNSS is lost"
+    return documents.StartHeading(expected, p95, aligned.expected_m, aligned.p95_m, dominates, mend)
 
 
 def parse_gate(text: str) -> Gate:

@@ -124,7 +124,12 @@ def measure_errors(
                 # One after the other: all columns of a long log together would fill the memory.
                 each = pool.map if together > TRIAL_THREADS else map
                 at_each = partial(_at_horizon, row_of(model.name).spread)
-                rows.extend(each(at_each, group.tolist(), errors.T, of_few.heading.T[columns], tested, touching))
+                rows.extend(
+                    each(
+                        at_each, group.tolist(), errors.T, of_few.heading.T[columns], of_few.aligned.T[columns], tested,
+                        touching,
+                    )
+                )  # fmt: skip
                 if model.name == "icr":
                     first = len(errors) if learned is None else learned
                     before += each(_row, group.tolist(), errors[:first].T)
@@ -162,7 +167,7 @@ def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], tria
     return [
         model.errors_of(trials)
         if isinstance(model, ComparedRow)
-        else TrialErrors(none, _turn_errors(track, model.icrs, trials))
+        else TrialErrors(none, _turn_errors(track, model.icrs, trials), none)
         for model in predictors
     ]
 
@@ -174,6 +179,7 @@ class _AtHorizon(NamedTuple):
     bins: statistics.Histogram
     sums: statistics.BlockSums | None
     free: documents.ErrorRow | None
+    aligned: documents.AlignedErrors | None
 
 
 def _slipping_trials(run: Run, ends: Rows) -> list[Bools | None]:
@@ -256,12 +262,17 @@ def _errors(track: Track, model: Model, ends: Rows, pool: Executor) -> Floats:
 
 
 def _at_horizon(
-    spread: statistics.Spread, metres: float, errors: Floats, turned: Floats, blocks: statistics.Blocks | None,
-    slipping: Bools | None,
+    spread: statistics.Spread, metres: float, errors: Floats, turned: Floats, aligned: Floats,
+    blocks: statistics.Blocks | None, slipping: Bools | None,
 ) -> _AtHorizon:  # fmt: skip
-    """Return the statistics of one model at one horizon: `errors` (n,) [m], `turned` (k,) errors of its turns [rad].
+    """Return the statistics of one model at one horizon.
 
-    `slipping` (n,) marks the trials that touch a slip event; `spread` is what is known of other drives.
+    Parameters
+    ----------
+    spread : what is known of other drives
+    errors : (n,) [m]; turned : (k,) errors of its turns [rad]
+    aligned : (n,) errors with aligned start headings [m], empty for the filter's models
+    slipping : (n,) whether a trial touches a slip event
     """
     ranked = statistics.RankedTrials.of(errors)
     trials, expected, p50, p95, largest = ranked.summary()
@@ -276,12 +287,21 @@ def _at_horizon(
     numbers = (expected, p50, p95, largest, *shares, *intervals, turn_mean, turn_p95)
     row = documents.SummaryRow(metres, trials, *(known(float(number)) for number in numbers))
     free = None if slipping is None else _row(metres, errors[~slipping])
-    return _AtHorizon(row, bins, sums, free)
+    return _AtHorizon(row, bins, sums, free, _aligned(aligned, blocks))
+
+
+def _aligned(errors: Floats, blocks: statistics.Blocks | None) -> documents.AlignedErrors | None:
+    """Return the statistics of errors (n,) [m] with aligned start headings; None where there are none."""
+    if not np.isfinite(errors).any():
+        return None
+    ranked = statistics.RankedTrials.of(errors)
+    _, expected, p50, p95, _ = ranked.summary()
+    return documents.AlignedErrors(expected, p95, statistics.block_sums(errors, blocks, ranked, p50, p95))
 
 
 def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> documents.ModelResult:
     """Return the result of one model from its statistics at each horizon."""
-    rows, bins, sums, free = zip(*found, strict=True)
+    rows, bins, sums, free, aligned = zip(*found, strict=True)
     blocks = []
     for row, one in zip(rows, sums, strict=True):
         if one is not None:
@@ -289,4 +309,4 @@ def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> document
             blocks.append(documents.BlocksDocument(row.horizon_m, **plain(one._asdict() | {"errors_m": errors_m})))
     of_name = row_of(model.name)
     document = documents.ModelDocument(model.name, of_name.words, model.knows or of_name.knows, list(rows), blocks)
-    return documents.ModelResult(document, bins, sums, tuple(row for row in free if row is not None))
+    return documents.ModelResult(document, bins, sums, tuple(row for row in free if row is not None), aligned)

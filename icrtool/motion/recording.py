@@ -237,10 +237,13 @@ class TrialErrors(NamedTuple):
     ----------
     position : distance between open-loop position and reference [m]
     heading : size of the difference between the open-loop turn and the reference's turn [rad]
+    aligned : as `position`, of the path turned to begin in the direction of the reference's first `ALIGNED_OVER_M`
+        [m]; NaN where a trial is shorter than twice this distance
     """
 
     position: Floats
     heading: Floats
+    aligned: Floats
 
     @classmethod
     def none(cls, shape: tuple[int, ...]) -> TrialErrors:
@@ -254,6 +257,11 @@ ErrorsOf = Callable[[Trials], TrialErrors]
 PathAt = Callable[[Floats], tuple[Floats, Complexes]]
 """Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]. Each
 call computes the whole path."""
+
+
+ALIGNED_OVER_M = 2.0
+"""Distance over which the direction of a path is compared with the reference's [m]. Fixes of 1 cm show it to 0.4°, and
+an error of the turn rate has turned the path little by then."""
 
 
 def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> TrialErrors:
@@ -270,14 +278,21 @@ def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> 
     """
     track, first = recording.track, int(start.min())
     s, e = start - first, end - first
+    a = np.minimum(np.searchsorted(track.distance, track.distance[start] + ALIGNED_OVER_M) - first, e)
     used = np.zeros(int(e.max()) + 1, np.bool_)
-    used[s] = used[e] = True
+    used[s] = used[e] = used[a] = True
     rows, number = first + np.flatnonzero(used), np.cumsum(used) - 1
     turned, place = path(recording.track.t[rows])
-    s, e, off = number[s], number[e], turned - track.heading[rows]
+    s, e, a, off = number[s], number[e], number[a], turned - track.heading[rows]
     turn, reference = np.exp(-1j * off), track.north[rows] + 1j * track.east[rows]
-    missed = turn[s] * (place[e] - place[s]) - (reference[e] - reference[s])
-    return TrialErrors(np.abs(missed), np.abs(off[e] - off[s]))
+    made, driven = turn[s] * (place[e] - place[s]), reference[e] - reference[s]
+    # a robot that turns back within the first metres shows no direction
+    began, of_reference = turn[s] * (place[a] - place[s]), reference[a] - reference[s]
+    shown = np.minimum(np.abs(began), np.abs(of_reference)) > ALIGNED_OVER_M / 2.0
+    made_aligned = made * np.where(shown, np.exp(1j * np.angle(of_reference * np.conj(began))), 1.0)
+    long_enough = track.distance[end] - track.distance[start] >= 2.0 * ALIGNED_OVER_M
+    aligned = np.where(long_enough, np.abs(made_aligned - driven), np.nan)
+    return TrialErrors(np.abs(made - driven), np.abs(off[e] - off[s]), aligned)
 
 
 def predicted_path(

@@ -217,6 +217,26 @@ class UsedCalibration(Record, frozen=True):
     fitted: str = ""
 
 
+class StartHeading(Record, frozen=True):
+    """What the heading at the start of a trial costs: errors of a row as they are, and with aligned start headings.
+
+    Attributes
+    ----------
+    expected_m, p95_m : as the row has them
+    aligned_expected_m, aligned_p95_m : of the paths that begin in the direction of the reference's first metres
+    dominates : more than half of the square of p95 is due to the heading at the start, beyond the interval of the
+        difference
+    mend : what the user can do about it
+    """
+
+    expected_m: float
+    p95_m: float
+    aligned_expected_m: float
+    aligned_p95_m: float
+    dominates: bool
+    mend: str
+
+
 class BestRow(Record, frozen=True):
     """The row to drive with: the row of smallest expected error among the rows by wheels alone for a robot.
 
@@ -224,12 +244,14 @@ class BestRow(Record, frozen=True):
     ----------
     model : its name; horizon_m : where errors are compared, 10 m or the nearest distance with trials
     as_good : rows for comparison (no_slip, vendor) whose expected error is not shown to be larger
+    start_heading : what its start headings cost; missing where it is not known
     """
 
     model: str
     horizon_m: float
     expected_error_m: float
     as_good: tuple[str, ...] = ()
+    start_heading: StartHeading | UnsetType = UNSET
 
 
 class TurningSplit(Record, frozen=True):
@@ -284,6 +306,14 @@ class TrialDocument(Record, frozen=True):
     errors_m: dict[str, Number]
 
 
+class AlignedErrors(NamedTuple):
+    """Errors of trials with aligned start headings [m], and their sums over blocks of path."""
+
+    expected_m: float
+    p95_m: float
+    sums: BlockSums | None
+
+
 class ModelResult(NamedTuple):
     """The errors of one model's trials.
 
@@ -293,12 +323,14 @@ class ModelResult(NamedTuple):
     histograms : by horizon
     block_sums : by horizon, to all digits; None where there is too little path
     without_events : by horizon, of the trials that touch no slip event; empty where the run has none
+    aligned : by horizon, with aligned start headings; None where they are not known
     """
 
     document: ModelDocument
     histograms: tuple[Histogram, ...]
     block_sums: tuple[BlockSums | None, ...]
     without_events: tuple[ErrorRow, ...] = ()
+    aligned: tuple[AlignedErrors | None, ...] = ()
 
     @property
     def name(self) -> str:

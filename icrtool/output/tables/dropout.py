@@ -163,17 +163,27 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
             name, lead, next_drive, _ = rows[0]
             then = f"; on the next drive on this ground {next_drive} (9 of 10)" if next_drive else ""
             text = f"within {budget_m:g} m (95 %) on this drive, by wheel speeds alone with {name}{then}"
+            text += "".join(f"; {line}" for line in heading_lines(report))
         shown = [(shortened(name, LONGEST_ROW_NAME), *rest) for name, *rest in rows]
         head = (f"within {budget_m:g} m (95 %)", "this drive", NEXT_DRIVE, "")
         blocks.append(Table("lrrl", shown, head, "How far without GNSS?"))
         blocks.append(Section("Other models", [Table("lrrl", others, head)], VERBOSE))
     if blocks:
-        blocks += [*as_good_lines(report), NEXT_DRIVE_MEANS]
+        blocks += [*heading_lines(report), *as_good_lines(report), NEXT_DRIVE_MEANS]
     else:
         blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
         blocks.append(Facts([("left out", f"recommended, controller: {report.ladder.left_out}")]))
     return Section("How far without GNSS?", blocks, lead=lead, text=text)
+
+
+def heading_lines(report: DropoutDocument) -> Iterator[str]:
+    """Yield that the heading at the start makes most of the error of the best row, and what mends it."""
+    found = UNSET if report.best is None else report.best.start_heading
+    if report.best is not None and found is not UNSET and found.dominates:
+        whole = f"{error_text(found.p95_m)} after {report.best.horizon_m:g} m (95 %)"
+        left = f"{error_text(found.aligned_p95_m)} remain with aligned headings"
+        yield f"the heading at the start makes most of the error: {whole}, of which {left}; {found.mend}"
 
 
 def as_good_lines(report: DropoutDocument) -> Iterator[str]:
