@@ -63,6 +63,7 @@ BATCH = options.together(
     flag("--redo", "Also process logs that are done."),
     options.reporting(flag("--overwrite", "Also replace runs of other recordings.")),
     options.CONFIGURATION,
+    options.INPUT_LIMITS,
 )
 
 

@@ -38,6 +38,7 @@ LARGEST_PLAN_BYTES = 50_000_000
 @option("--plot", "FILE", NEW_PICTURE, "Draw the residuals before and after the calibration: png, svg, pdf. One log.")
 @options.ALLOW_UNUSABLE
 @options.CONFIGURATION
+@options.INPUT_LIMITS
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def calibrate_command(
     sources: tuple[Path, ...],

@@ -74,6 +74,7 @@ REPORT_OPTIONS = options.reporting(
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
 @REPORT_OPTIONS
 @options.CONFIGURATION
+@options.INPUT_LIMITS
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def dropout_report_command(
     sources: tuple[Path, ...], place: ResultPlace, calibration_files: tuple[Path, ...], report: ReportRequest,

@@ -56,6 +56,7 @@ REQUEST = options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", o
 @REQUEST
 @flag("--strict", "Exit with status 3 where a run must not be used.")
 @options.CONFIGURATION
+@options.INPUT_LIMITS
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def fit_command(
     logs: tuple[Path, ...], place: ResultPlace, warm_start: Path | None, request: FitRequest, files: ResultFiles,
@@ -128,6 +129,7 @@ def fitted_log(
 @options.LOGS
 @options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", options.CUT)
 @options.CONFIGURATION
+@options.INPUT_LIMITS
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSources, printer: Printer) -> None:
     """List what each log holds, which topics are used for wheels, position and heading, and the problems found.

@@ -33,7 +33,7 @@ with when_used():
     from icrtool.output import dropout_directory
     from icrtool.output.exports import acceptance
     from icrtool.output.files import atomic, formats
-    from icrtool.records import rows
+    from icrtool.records import input_limits, rows
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
@@ -259,6 +259,36 @@ def topics_of(logs: object) -> tuple[str, ...]:
         container.close()
     return tuple(sorted(topics))
 
+
+def _limit(variable: str, read: str) -> Callable[[click.Context, click.Parameter, str | None], None]:
+    """Return what reads the value of an option that limits inputs, and sets it for the time of the command.
+
+    Parameters
+    ----------
+    variable, read : names in `icrtool.records.input_limits`: of the variable, and of the function that reads its value
+    """
+
+    def set_limit(context: click.Context, _option: click.Parameter, text: str | None) -> None:
+        if text is None:
+            return
+        try:
+            value = getattr(input_limits, read)(text)
+        except ValueError as err:
+            raise click.BadParameter(str(err)) from None
+        context.with_resource(input_limits.limited(getattr(input_limits, variable), value))
+
+    return set_limit
+
+
+INPUT_LIMITS = add_all(
+    option("--most-bytes", "N", None, "Most that is saved of standard input or of a file at an address, for example "
+           "800000, 500M or 2GB; default: half of the free space of the temporary folder.",
+           expose_value=False, callback=_limit("MOST_BYTES", "bytes_in")),
+    option("--server-timeout", "SECONDS", None, "Give up a server that sends nothing for this time, or less than "
+           "10 kB/s after it; default: 15.",
+           expose_value=False, callback=_limit("SERVER_TIMEOUT_S", "seconds_in")),
+)  # fmt: skip
+"""--most-bytes and --server-timeout, which hold while the command runs, and in the processes that it starts."""
 
 CONFIGURATION = together(
     "settings",

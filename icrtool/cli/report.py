@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 @option("--into", "DIR", FILE, "Folder of the run directories of logs; default: icrtool-runs.")
 @flag("--overwrite", "Also replace the run of another recording, or one that was made with other settings.")
 @options.CONFIGURATION
+@options.INPUT_LIMITS
 @options.printing(options.QUIET, options.VERBOSE_OPTION)
 def report_command(
     sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, into: Path | None, overwrite: bool,
@@ -171,6 +172,7 @@ def _as_written(place: Path, advice: str) -> Iterator[None]:
 @option("-o --output", "FILE", NEW_FILE, "Write the comparison as JSON, for icrtool report.")
 @option("--plot", "FILE", NEW_PICTURE, "Draw the comparison: png, svg, pdf.")
 @options.CONFIGURATION
+@options.INPUT_LIMITS
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def compare_command(
     sources: tuple[str, ...],

@@ -32,7 +32,7 @@ from icrtool.logs.containers.recording_files import (
     unpacked_name,
 )
 from icrtool.logs.containers.ros1_bag import Ros1Bag
-from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, most_bytes, read_by_ranges
+from icrtool.logs.containers.source import RemoteFile, SavedBytes, changed_since, fetch_folder, read_by_ranges
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save_unpacked, unpack
 from icrtool.records.notes import Note
@@ -231,7 +231,8 @@ def _brought(
         if start and not is_packed(start) and container_of(BytesIO(start)) is None:
             raise LogError(path, *_NOT_A_LOG)
 
-    digest = save_unpacked(sys.stdin.buffer, log, check, most_bytes(folder))
+    saved = SavedBytes.into(folder)
+    digest = save_unpacked(sys.stdin.buffer, log, check, lambda count: saved.check(path, count))
     return log, Origin((InputFile(str(path), log.stat().st_size, digest),)), distant
 
 

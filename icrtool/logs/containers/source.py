@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from threading import Lock, local
 from typing import Any, NamedTuple, TypeVar
@@ -25,17 +26,19 @@ from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.container import ahead
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, natural_order, unpacked_name
-from icrtool.records.places import SCHEMES, UrlPath, place_of, without_secrets
+from icrtool.records.input_limits import most_bytes, server_timeout_s
+from icrtool.records.places import LARGEST_DOCUMENT_BYTES, SCHEMES, UrlPath, place_of, without_secrets
 from icrtool.records.samples import InputFile
 from icrtool.records.text import LONGEST_NAME
 
 Result = TypeVar("Result")
 
-QUIET_S = 15.0
-"""Longest time in which a server may send nothing [s]."""
-
 SLOWEST_BPS = 10_000
-"""Slowest rate at which a server may send a range [bytes/s]."""
+"""Slowest rate at which a server may send what it was asked for, after `server_timeout_s` [bytes/s]. A server that
+sends a byte now and then would else keep a command for days."""
+
+LARGEST_LISTING_BYTES = 1 << 22
+"""Largest page that a web server may send as the list of a folder [bytes]: some 40,000 names."""
 
 _NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
           "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
@@ -62,6 +65,9 @@ _LEAST_BYTES = 1 << 18
 """Bytes of a distant file that are read at once, at least: the records of an index follow one another."""
 
 _FETCHED_BYTES, PIECES_AHEAD = 1 << 24, 4
+
+_START_BYTES, _READ_BYTES = 512, 1 << 16
+"""Bytes that show what a file is; bytes of a page that are read at a time."""
 
 
 def filesystem(path: UrlPath) -> tuple[Any, str]:
@@ -91,13 +97,56 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
 
 def _patience(scheme: str) -> dict[str, Any]:
     """Return the settings of a file system with which requests to a silent server end."""
+    quiet_s = server_timeout_s()
     if scheme.startswith("http"):
         from aiohttp import ClientTimeout
 
-        return {"client_kwargs": {"timeout": ClientTimeout(total=None, sock_connect=QUIET_S, sock_read=QUIET_S)}}
+        timeout = ClientTimeout(total=None, sock_connect=quiet_s, sock_read=quiet_s)
+        return {"client_kwargs": {"timeout": timeout, "response_class": _short_pages()}}
     if scheme.startswith("s3"):
-        return {"config_kwargs": {"connect_timeout": QUIET_S, "read_timeout": QUIET_S, "retries": {"max_attempts": 1}}}
+        return {"config_kwargs": {"connect_timeout": quiet_s, "read_timeout": quiet_s, "retries": {"max_attempts": 1}}}
     return {}
+
+
+@cache
+def _short_pages() -> type[Any]:
+    """Return the class of answers of web servers whose whole body is not read beyond `LARGEST_LISTING_BYTES`."""
+    from aiohttp import ClientResponse
+
+    class ShortPage(ClientResponse):
+        async def read(self) -> bytes:
+            if self._body is None:
+                body, began_s = bytearray(), time.monotonic()
+                while piece := await self.content.read(_READ_BYTES):
+                    body += piece
+                    _check_pace(began_s, len(body))
+                    if len(body) > LARGEST_LISTING_BYTES:
+                        raise ValueError(f"its server sends a list of more than {LARGEST_LISTING_BYTES:,} bytes")
+                self._body = bytes(body)
+            return self._body
+
+    return ShortPage
+
+
+def _in_time(files: Any, method: str, *given: object, expected_bytes: int = 0, **named: object) -> Any:  # noqa: ANN401 - of a library
+    """Return what a method of a file system returns; `TimeoutError` where its server sends too slowly.
+
+    Parameters
+    ----------
+    expected_bytes : that the answer has
+    """
+    if not getattr(files, "async_impl", False):
+        return getattr(files, method)(*given, **named)
+    from fsspec.asyn import sync
+
+    seconds = server_timeout_s() + expected_bytes / SLOWEST_BPS
+    return sync(files.loop, getattr(files, f"_{method}"), *given, timeout=seconds, **named)
+
+
+def _check_pace(began_s: float, received: int) -> None:
+    """Refuse a server that sent fewer bytes than `SLOWEST_BPS` asks for, since a time of `time.monotonic`."""
+    if time.monotonic() - began_s > server_timeout_s() + received / SLOWEST_BPS:
+        raise TimeoutError
 
 
 def asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done: str = "read") -> Result:
@@ -133,7 +182,8 @@ def asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done:
 def _words_of(cause: BaseException, path: UrlPath) -> str:
     """Return what an error of a library states, without the secrets of the address."""
     if isinstance(cause, TimeoutError):
-        return f"its server sent nothing for {QUIET_S:g} s, or too slowly"
+        quiet, rate = f"{server_timeout_s():g} s", f"{SLOWEST_BPS / 1e3:g} kB/s"
+        return f"its server sent nothing for {quiet}, or less than {rate} after them; --server-timeout sets the time"
     status = getattr(cause, "status", None)
     if isinstance(status, int):
         # the rest of such a text is the address, or another address to which the server redirected
@@ -252,8 +302,9 @@ class RemoteFile:
         async def one(begin: int, end: int) -> bytes:
             session = await self._files.set_session()
             headers = {"Range": f"bytes={begin}-{end - 1}", "Accept-Encoding": "identity"}
+            began_s = time.monotonic()
             async with (
-                asyncio.timeout(QUIET_S + (end - begin) / SLOWEST_BPS),
+                asyncio.timeout(server_timeout_s() + (end - begin) / SLOWEST_BPS),
                 session.get(self._files.encode_url(self._name), headers=headers) as answer,
             ):
                 if answer.status >= 400:
@@ -263,6 +314,7 @@ class RemoteFile:
                 while left and (piece := await answer.content.read(left)):
                     pieces.append(piece)
                     left -= len(piece)
+                    _check_pace(began_s, end - begin - left)
                 return b"".join(pieces)
 
         async def all_of_them() -> list[bytes]:
@@ -310,7 +362,9 @@ class RemoteFile:
         def ask() -> list[bytes]:
             if self.path.scheme.startswith("http"):
                 return self._web_ranges(begins, ends)
-            pieces = self._files.cat_ranges([self._name] * len(begins), begins, ends)
+            expected = sum(ends) - sum(begins)
+            names = [self._name] * len(begins)
+            pieces = _in_time(self._files, "cat_ranges", names, begins, ends, expected_bytes=expected)
             if (broken := next((one for one in pieces if isinstance(one, BaseException)), None)) is not None:
                 raise broken
             return list(map(bytes, pieces))
@@ -324,9 +378,12 @@ class RemoteFile:
 
     def start(self) -> bytes:
         """Return the first 512 bytes, without any range; fewer of a shorter file."""
+        start = b""
         for piece in self._pieces():
-            return piece[:512]
-        return b""
+            start += piece[: _START_BYTES - len(start)]
+            if len(start) == _START_BYTES:
+                break
+        return start
 
     def fetch(self, place: Path, share: Callable[[float], None] | None) -> InputFile:
         """Write the file to a place on disk, and return what run.json states about it.
@@ -338,12 +395,13 @@ class RemoteFile:
         OSError
             The disk is full.
         """
-        digest, written, most = hashlib.sha256(), 0, most_bytes(place.parent)
+        digest, written, saved = hashlib.sha256(), 0, SavedBytes.into(place.parent)
+        saved.check(self.path, self.size)
         with place.open("wb") as sink:
             for piece in self._pieces():
-                if written + len(piece) > (min(self.size, most) if self.size else most):
-                    why = f"sends more than {min(self.size, most) if self.size else most:,} bytes"
-                    raise LogError(self.path, why, "its size as stated, or half of the free space")
+                saved.check(self.path, written + len(piece))
+                if self.size and written + len(piece) > self.size:
+                    raise LogError(self.path, f"sends more than the {self.size:,} bytes that its server states")
                 sink.write(piece)
                 digest.update(piece)
                 written += len(piece)
@@ -355,8 +413,11 @@ class RemoteFile:
         """Yield the content from start to end; the next pieces are read meanwhile."""
         if not self.has_ranges:
             options = {"headers": {"Accept-Encoding": "identity"}} if self.path.scheme.startswith("http") else {}
+            began_s, received = time.monotonic(), 0
             with asked(self.path, lambda: self._files.open(self._name, block_size=0, **options)) as stream:
                 while piece := asked(self.path, lambda: stream.read(_FETCHED_BYTES), again=False):
+                    received += len(piece)
+                    asked(self.path, partial(_check_pace, began_s, received), again=False)
                     yield piece
             return
         places = range(0, self.size, _FETCHED_BYTES)
@@ -368,9 +429,31 @@ class RemoteFile:
         self._last = _OfThread()
 
 
-def most_bytes(folder: Path) -> int:
-    """Return how much of an input without a known end is saved in a folder: half of the free space [bytes]."""
-    return shutil.disk_usage(folder).free // 2
+class SavedBytes(NamedTuple):
+    """How much of an input is saved in the temporary folder [bytes], and where this limit comes from."""
+
+    most: int
+    why: str
+
+    @classmethod
+    def into(cls, folder: Path) -> SavedBytes:
+        """Return the limit for a folder: that of `most_bytes`, else half of the free space."""
+        given = most_bytes()
+        if given is not None:
+            return cls(given, "--most-bytes")
+        return cls(shutil.disk_usage(folder).free // 2, "half of the free space in the temporary folder")
+
+    def check(self, path: Path, count: int) -> None:
+        """Refuse more bytes than are saved.
+
+        Raises
+        ------
+        LogError
+            There are more.
+        """
+        if count > self.most:
+            why = f"sends more than {self.most:,} bytes ({self.why})"
+            raise LogError(path, why, "--most-bytes N lets more be saved; TMPDIR names another temporary folder")
 
 
 def read_by_ranges(files: Collection[RemoteFile]) -> str:
@@ -393,7 +476,7 @@ def _about(path: UrlPath) -> dict[str, Any]:
     """Return what a store states about a file now, whatever it stated before."""
     files, name = filesystem(path)
     files.invalidate_cache(name)
-    about: dict[str, Any] = asked(path, lambda: files.info(name))
+    about: dict[str, Any] = asked(path, lambda: _in_time(files, "info", name))
     return about
 
 
@@ -449,7 +532,9 @@ def find(path: UrlPath) -> list[UrlPath]:
             raise LogError(path, "no recording in it", f"a log has one of the suffixes {suffixes}")
         return found
     files, name = filesystem(path)
-    matched: dict[str, Any] = asked(path, lambda: files.glob(name, detail=True))
+    # folders in folders without an end are no reason to go on for ever
+    most = LARGEST_LISTING_BYTES if path.scheme.startswith("http") else LARGEST_DOCUMENT_BYTES
+    matched: dict[str, Any] = asked(path, lambda: _in_time(files, "glob", name, detail=True, expected_bytes=most))
     found = []
     for inner, about in matched.items():
         one = _address(files, inner, path)

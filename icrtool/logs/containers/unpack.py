@@ -7,7 +7,6 @@ directory in an archive; what stands in an archive may be compressed again.
 from __future__ import annotations
 
 import bz2
-import errno
 import hashlib
 import lzma
 import math
@@ -201,27 +200,30 @@ def is_packed(start: bytes) -> bool:
     return start.startswith((_ZIP, *DECODERS)) or start[_TAR_MARK] == _TAR
 
 
-def save_unpacked(source: Readable, place: Path, check: Callable[[bytes], None], most_bytes: int) -> str:
+def save_unpacked(
+    source: Readable, place: Path, check: Callable[[bytes], None], check_length: Callable[[int], None]
+) -> str:
     """Write a stream to a file, and return the SHA-256 of it (hex).
 
     Parameters
     ----------
     check : called with the first 512 bytes, before any more is read; refuses a stream by an error of its own
+    check_length : called with the number of bytes before they are written; refuses a stream that is too long
 
     Raises
     ------
     OSError
-        The disk is full, or the stream is longer than `most_bytes`.
+        The disk is full.
     """
-    digest, left, start = hashlib.sha256(), most_bytes, b""
+    digest, written, start = hashlib.sha256(), 0, b""
     while len(start) < _TAR_BLOCK_BYTES and (piece := source.read(_TAR_BLOCK_BYTES - len(start))):
         start += piece
     check(start)
     with place.open("wb") as sink:
         piece = start
         while piece or (piece := source.read(_PIECE_BYTES)):
-            if (left := left - len(piece)) < 0:
-                raise OSError(errno.EFBIG, f"more than {most_bytes:,} bytes, half of the free space")
+            written += len(piece)
+            check_length(written)
             sink.write(piece)
             digest.update(piece)
             piece = b""

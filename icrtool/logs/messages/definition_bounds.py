@@ -32,7 +32,7 @@ _IDL_NUMBER_WEIGHT = 2000
 _SCHEMA_SHARE = 8
 """Characters of JSON, or bytes of Protobuf, whose cost is one character of ROS definitions."""
 
-_IDL_NUMBER = re.compile(r"[\[<]|(?<!=)=(?!=)")
+_EQUAL_SIGNS = re.compile(r"=+")
 _LONG_WORD = re.compile(rf"[\w/]{{{LONGEST_TEXT + 1}}}")
 _MODULE = re.compile(r"\bmodule\s+(\w+)\s*\{|[{}]")
 COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
@@ -113,6 +113,7 @@ class DefinitionBudget:
     left: int = MOST_PARSED
     refused: dict[tuple[str, str], DefinitionError] = field(default_factory=dict)
     _parsed: set[tuple[str, str]] = field(default_factory=set)
+    _costs: dict[tuple[str, str], int] = field(default_factory=dict)
 
     def take(self, channel: Channel) -> None:
         """Count the definition of a channel when it comes for the first time.
@@ -122,21 +123,32 @@ class DefinitionBudget:
         DefinitionError
             The definitions before it used up the limit, and this definition is not parsed.
         """
-        one, cost = (channel.message_type, channel.definition), len(channel.definition)
+        one = channel.message_type, channel.definition
         if (before := self.refused.get(one)) is not None:
             raise before
         if one in self._parsed:
             return
-        if channel.encoding in ("json", "protobuf"):
-            cost //= _SCHEMA_SHARE
-        elif channel.definition_format == "idl":
-            cost = _IDL_WEIGHT * cost + _IDL_NUMBER_WEIGHT * len(_IDL_NUMBER.findall(channel.definition))
-        cost += _LEAST_COST
+        if (cost := self._costs.get(one)) is None:
+            cost = self._costs[one] = self._cost_of(channel)
         if cost > self.left:
             why = f"the definitions of its types are longer than {MOST_PARSED} characters together"
             raise DefinitionError(channel.topic, why, "name the topics that are needed in [topics]")
         self.left -= cost
         self._parsed.add(one)
+
+    def _cost_of(self, channel: Channel) -> int:
+        """Return what it costs to parse a definition; beyond what is left, the first part that shows it."""
+        text = channel.definition
+        if channel.encoding in ("json", "protobuf"):
+            return len(text) // _SCHEMA_SHARE + _LEAST_COST
+        if channel.definition_format != "idl":
+            return len(text) + _LEAST_COST
+        cost = _IDL_WEIGHT * len(text) + _LEAST_COST
+        if cost > self.left:
+            return cost
+        # the numbers of IDL stand behind a bracket or a single equals sign; separators are rows of these signs
+        numbers = text.count("[") + text.count("<") + sum(len(one) == 1 for one in _EQUAL_SIGNS.findall(text))
+        return cost + _IDL_NUMBER_WEIGHT * numbers
 
     def spend(self, channel: Channel, fields: int | DefinitionError) -> None:
         """Count the fields of a channel's layout, which may be many; a refused layout counts as `MOST_FIELDS`."""

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
+import shutil
 import socket
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from icrtool.errors import LogError
+from icrtool.errors import ConfigError, LogError
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.source import filesystem
+from icrtool.logs.containers.source import SavedBytes, filesystem, find
+from icrtool.records.input_limits import MOST_BYTES, SERVER_TIMEOUT_S, most_bytes, server_timeout_s
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.samples import InputFile
 
@@ -88,7 +95,9 @@ def test_what_identifies_a_file_is_its_content_or_its_whole_address() -> None:
 
 
 @contextmanager
-def lying_server(answer: bytes, forever: bytes = b"") -> Iterator[tuple[str, list[int]]]:
+def lying_server(
+    answer: bytes, forever: bytes = b"", *, pause_s: float = 0.0, stated: bytes = b"Content-Length: 1000000\r\n"
+) -> Iterator[tuple[str, list[int]]]:
     """Answer HEAD with a size of 1 MB, and GET with what is given; count what is sent."""
     listening = socket.create_server(("127.0.0.1", 0))
     sent = [0]
@@ -98,12 +107,14 @@ def lying_server(answer: bytes, forever: bytes = b"") -> Iterator[tuple[str, lis
             try:
                 while request := client.recv(65536):
                     if request.startswith(b"HEAD"):
-                        client.sendall(b'HTTP/1.1 200 OK\r\nContent-Length: 1000000\r\nETag: "a"\r\n\r\n')
+                        client.sendall(b"HTTP/1.1 200 OK\r\n" + stated + b'ETag: "a"\r\n\r\n')
                         continue
-                    client.sendall(answer)
+                    asked = re.search(rb"Range: bytes=(\d+-\d+)", request)
+                    client.sendall(answer.replace(b"RANGE", asked[1] if asked is not None else b""))
                     while forever and sent[0] < 200_000_000:
                         client.sendall(forever)
                         sent[0] += len(forever)
+                        time.sleep(pause_s)
                     return
             except OSError:
                 return
@@ -147,12 +158,99 @@ def test_a_server_that_lies_about_a_range_is_refused_and_little_is_read(lie: str
 
 def test_a_silent_server_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
-    from icrtool.logs.containers import source
-
-    monkeypatch.setattr(source, "QUIET_S", 0.3)
+    monkeypatch.setenv(SERVER_TIMEOUT_S, "0.3")
     start = b"HTTP/1.1 206 P\r\nContent-Range: bytes 999999-999999/1000000\r\nContent-Length: 1\r\n\r\n"
     with lying_server(start) as (url, _), pytest.raises(LogError):
         open_log(UrlPath(url))
+
+
+SLOW = {
+    "a range": b"HTTP/1.1 206 P\r\nContent-Range: bytes RANGE/1000000\r\n" + CHUNKED + b"\r\n1\r\n\0\r\n",
+    "a file of a server without ranges": b"HTTP/1.1 200 OK\r\n" + CHUNKED + b"\r\n200\r\n"
+    + b"\x89MCAP0\r\n".ljust(512, b"\0") + b"\r\n",
+    "a page that lists a folder": b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\n" + CHUNKED + b"\r\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SLOW)
+def test_a_server_that_sends_a_byte_now_and_then_is_given_up(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    monkeypatch.setenv(SERVER_TIMEOUT_S, "1")
+    began = time.monotonic()
+    with lying_server(SLOW[kind], b"1\r\n\0\r\n", pause_s=0.05) as (url, _), pytest.raises(LogError) as error:
+        if kind == "a page that lists a folder":
+            find(UrlPath(url.replace("a.mcap", "folder/*.mcap")))
+        open_log(UrlPath(url))
+    assert "sent nothing for 1 s, or less than 10 kB/s" in str(error.value)
+    assert time.monotonic() - began < 15.0
+
+
+def test_a_page_without_an_end_that_lists_a_folder_is_refused() -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    with lying_server(SLOW["a page that lists a folder"], CHUNK) as (url, sent), pytest.raises(LogError) as error:
+        find(UrlPath(url.replace("a.mcap", "folder/*.mcap")))
+    assert len(str(error.value).splitlines()) == 1
+    assert sent[0] < 60_000_000
+
+
+def test_a_body_without_an_end_is_fetched_up_to_the_given_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    monkeypatch.setenv(MOST_BYTES, "2MB")
+    with (
+        lying_server(SLOW["a file of a server without ranges"], CHUNK, stated=b"") as (url, sent),
+        pytest.raises(LogError, match=r"more than 2,000,000 bytes \(--most-bytes\)") as error,
+    ):
+        open_log(UrlPath(url))
+    assert len(str(error.value).splitlines()) == 1
+    assert sent[0] < 60_000_000
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("--most-bytes", "2MB"), "more than 2,000,000 bytes (--most-bytes)"),
+        (("--most-bytes", "1e9"), "is no number of bytes"),
+        (("--server-timeout", "-1"), "is no number of seconds above 0"),
+        (("--server-timeout", "inf"), "is no number of seconds above 0"),
+    ],
+)
+def test_a_log_without_an_end_on_standard_input_is_one_line(given: tuple[str, str], words: str) -> None:
+    command = [sys.executable, "-P", "-m", "icrtool", "info", "-", *given, "-q"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(b"\x89MCAP0\r\n")
+            for _ in range(500):
+                process.stdin.write(bytes(1 << 16))
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        errors = process.stderr.read().decode()
+    assert process.returncode in (1, 2)
+    assert words in errors.splitlines()[-1]
+    assert "Traceback" not in errors
+
+
+def test_without_a_limit_half_of_the_free_space_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9_000, 3_000, 6_000))
+    saved = SavedBytes.into(tmp_path)
+    saved.check(Path("-"), 3_000)
+    with pytest.raises(LogError, match="more than 3,000 bytes"):
+        saved.check(Path("-"), 3_001)
+
+
+@pytest.mark.parametrize(("text", "count"), [("800000", 800_000), ("500M", 500_000_000), ("2.5GB", 2_500_000_000)])
+def test_bytes_are_stated_with_or_without_a_unit(text: str, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(MOST_BYTES, text)
+    assert most_bytes() == count
+
+
+def test_a_limit_of_the_environment_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(MOST_BYTES, "much")
+    monkeypatch.setenv(SERVER_TIMEOUT_S, "0")
+    with pytest.raises(ConfigError, match=MOST_BYTES):
+        most_bytes()
+    with pytest.raises(ConfigError, match=SERVER_TIMEOUT_S):
+        server_timeout_s()
 
 
 def test_standard_input_that_is_no_log_is_refused_by_its_first_bytes(monkeypatch: pytest.MonkeyPatch) -> None:

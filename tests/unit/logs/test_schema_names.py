@@ -7,6 +7,7 @@ import json
 import time
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from icrtool.errors import DefinitionError, IcrToolError
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.definition_bounds import MOST_NAME_CHARACTERS
+from icrtool.logs.messages.definition_bounds import MOST_NAME_CHARACTERS, DefinitionBudget
 from icrtool.logs.messages.topic_table import collector_for
 from icrtool.logs.read_log import survey_log
 from icrtool.records.text import LONGEST_TEXT, LogText
@@ -126,3 +127,18 @@ def test_hundreds_of_topics_of_long_definitions_take_no_more_than_one(
     with contextlib.suppress(IcrToolError):
         survey_log(path)
     assert time.process_time() - begin < LONGEST_S
+
+
+@pytest.mark.parametrize("characters", [100_000, 1_200_000])
+def test_a_long_definition_that_many_topics_share_is_weighed_once(characters: int) -> None:
+    budget, refused = DefinitionBudget(), 0
+    channel = idl(["wheel_left"], ["n" * characters])
+    channel = replace(channel, definition=channel.definition + "=" * 200)
+    begin = time.process_time()
+    for _ in range(500):
+        try:
+            budget.take(channel)
+        except DefinitionError:
+            refused += 1
+    assert time.process_time() - begin < 0.25 * LONGEST_S
+    assert refused == (500 if characters > 1_000_000 else 0)

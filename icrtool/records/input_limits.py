@@ -1,0 +1,97 @@
+"""Limits of what is read from standard input and from servers.
+
+The environment of the process holds them: the processes that a batch starts inherit it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from icrtool.errors import ConfigError
+
+MOST_BYTES, SERVER_TIMEOUT_S = "ICRTOOL_MOST_BYTES", "ICRTOOL_SERVER_TIMEOUT_S"
+"""Environment variables with the limits: bytes that are saved of an input, and seconds in which a server may send
+nothing."""
+
+QUIET_S = 15.0
+"""Longest time in which a server may send nothing, where nothing else is set [s]."""
+
+_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+
+
+def bytes_in(text: str) -> int:
+    """Return the bytes that a text states: ``800000``, ``500M``, ``2GB``.
+
+    Raises
+    ------
+    ValueError
+        It states no number of bytes above 0.
+    """
+    found = re.fullmatch(r"\s*(\d{1,18}(?:\.\d{1,9})?)\s*([kMGT]?)B?\s*", text, re.ASCII)
+    count = int(float(found[1]) * _UNITS[found[2]]) if found is not None else 0
+    if count < 1:
+        raise ValueError(f"{text!r} is no number of bytes; for example 800000, 500M or 2GB")
+    return count
+
+
+def seconds_in(text: str) -> float:
+    """Return the seconds that a text states.
+
+    Raises
+    ------
+    ValueError
+        It states no finite number above 0.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0.0 < seconds < math.inf:
+        raise ValueError(f"{text!r} is no number of seconds above 0")
+    return seconds
+
+
+def most_bytes() -> int | None:
+    """Return how many bytes of an input are saved at most; None where nothing states it.
+
+    Raises
+    ------
+    ConfigError
+        The environment states no number of bytes.
+    """
+    try:
+        return bytes_in(text) if (text := os.environ.get(MOST_BYTES)) else None
+    except ValueError as err:
+        raise ConfigError(MOST_BYTES, str(err)) from None
+
+
+def server_timeout_s() -> float:
+    """Return the longest time in which a server may send nothing [s].
+
+    Raises
+    ------
+    ConfigError
+        The environment states no number of seconds.
+    """
+    try:
+        return seconds_in(text) if (text := os.environ.get(SERVER_TIMEOUT_S)) else QUIET_S
+    except ValueError as err:
+        raise ConfigError(SERVER_TIMEOUT_S, str(err)) from None
+
+
+@contextmanager
+def limited(variable: str, value: float) -> Iterator[None]:
+    """Have a limit in the environment of this process until the block ends."""
+    before = os.environ.get(variable)
+    os.environ[variable] = f"{value!r}"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[variable]
+        else:
+            os.environ[variable] = before
