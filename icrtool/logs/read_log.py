@@ -22,7 +22,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError, LogError
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut
+from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut, counted_ns
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED_SUFFIX, log_name
 from icrtool.logs.messages.definition_bounds import DefinitionBudget
@@ -30,6 +30,7 @@ from icrtool.logs.messages.definitions import definition_note
 from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, collector_for
 from icrtool.logs.streams.assembly import Survey, assemble, longest_part
 from icrtool.logs.streams.positions import TRANSFORM_TYPES, is_static, transform_pose
+from icrtool.logs.streams.repeats import find_repeats, first_pass
 from icrtool.logs.streams.select import fields_to_take, find_candidates
 from icrtool.records.notes import note
 from icrtool.records.places import UrlPath, place_of
@@ -142,6 +143,9 @@ def _collect(
     static = frozenset(channel.id for channel in container.channels if is_static(channel))
     cut = cut._replace(whole=static) if cut != WHOLE else cut
     tables, unread = collect_tables(container, wanted, cut, progress)
+    if (repeats := find_repeats(tables)) is not None:
+        container.report("recording_looped", repeats.text)
+        tables = [first_pass(table, repeats) for table in tables]
     by_id = {channel.id: channel for channel in container.channels}
     moving = {number for number in wanted if by_id[number].message_type in TRANSFORM_TYPES} - static
     poses = {by_id[number].topic for number in moving}
@@ -240,6 +244,8 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
     if start is None and end is None:
         return WHOLE
     first, span = 0, container.span_ns()
+    if span is not None and span[0] >= LATEST_NS:  # as the container counts such times
+        span = counted_ns(span[0]), counted_ns(span[1])
     if isinstance(start, float) or isinstance(end, float):
         if span is not None:
             first = span[0]

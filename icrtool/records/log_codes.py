@@ -111,6 +111,18 @@ OF_CLOCKS: dict[str, Explanation] = {
         "Stamps are moved as far as log time shows it, else sorted; errors near that moment can be too large.",
         "Fit each part alone with `--from` and `--to`. Synchronise the clocks before a recording (chrony, PTP).",
     ),
+    "log_time_impossible": Explanation(
+        "warning",
+        "All log times lie beyond the year 2116: the clock of the recorder was wrong.",
+        "Header stamps are used where all streams have them; of log times only order and intervals count.",
+        "Set the clock of the computer that records.",
+    ),
+    "recording_looped": Explanation(
+        "warning",
+        "Header stamps go back and all messages come again with the same values: a replay in a loop was recorded.",
+        "The first pass is used; the others would count the same errors again.",
+        "Give the original recording, or record a replay without a loop.",
+    ),
     "recording_paused": Explanation(
         "warning",
         "A stream has no samples for more than ten minutes.",
@@ -183,7 +195,7 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "header_clock": Explanation(
         "info",
-        "The header stamps of all streams are of one clock that is far from log time, as simulated time is.",
+        "The header stamps of all streams are of one clock far from log time, as in a simulation or a replay.",
         "The header stamps are used.",
         "None is needed. `topics.clock` sets which stamps are used.",
     ),

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from threading import Event
 from typing import Literal, NamedTuple, TypeVar
@@ -32,6 +33,17 @@ Report = Callable[[str, str], None]
 LATEST_NS = 1 << 62
 """Latest log time [ns], in the year 2116. A later time is damage, and differences of such times do not fit into 64
 bits."""
+
+
+Times = TypeVar("Times", int, Ints)
+
+
+def counted_ns(time_ns: Times) -> Times:
+    """Return log times beyond `LATEST_NS` as possible times of the same order and intervals.
+
+    Times around 2^63 and 2^64, which damaged clocks give, stay together.
+    """
+    return (time_ns + LATEST_NS // 2) & (LATEST_NS - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +112,7 @@ class Cut(NamedTuple):
         """
         if held is not None and not held & wanted:
             return False
-        known = 0 < begin_ns <= end_ns
+        known = 0 < begin_ns <= end_ns < LATEST_NS
         outside = known and (end_ns < self.begin_ns or begin_ns >= self.end_ns)
         return not outside or (bool(self.whole) and (held is None or bool(held & self.whole)))
 
@@ -305,8 +317,21 @@ class Container(ABC):
         """Release files, and remove what was made for it."""
         self.origin.remove()
 
+    @cached_property
+    def _is_beyond(self) -> bool:
+        """Whether the index shows that all log times are beyond `LATEST_NS`: the clock of the recorder was wrong."""
+        span = self.span_ns()
+        return span is not None and span[0] >= LATEST_NS
+
     def _with_possible_times(self, block: MessageBlock) -> MessageBlock:
-        """Return a block without the messages whose log time is negative or beyond `LATEST_NS`."""
+        """Return a block without the messages whose log time is negative or beyond `LATEST_NS`.
+
+        Where all log times are beyond it, `counted_ns` keeps their order and intervals.
+        """
+        if self._is_beyond:
+            why = "log times beyond the year 2116: the clock of the recorder was wrong; only their intervals are used"
+            self.report("log_time_impossible", why)
+            return block._replace(log_time_ns=counted_ns(block.log_time_ns))
         # Negative ones are above all others as unsigned numbers.
         possible = block.log_time_ns.view(np.uint64) < LATEST_NS
         if possible.all():

@@ -23,6 +23,7 @@ from icrtool.logs.streams.positions import antenna_place
 from icrtool.logs.streams.select import Candidates, Choice, choose_streams, ignored_joints, other_references
 from icrtool.logs.streams.sources import (
     BY_LOG,
+    NO_HEADER,
     Clock,
     Convention,
     HeadingSource,
@@ -30,9 +31,11 @@ from icrtool.logs.streams.sources import (
     Source,
     StampedRows,
     WheelSource,
+    as_replayed,
     by_header,
     by_log,
     increasing,
+    replay_speed,
     share_clock,
     stamp_rows,
 )
@@ -189,10 +192,18 @@ def _clock_of(chosen: Mapping[Role, Source], config: Config) -> tuple[Callable[[
                 why = f"{one.topic} has no header stamps that can be used ({one.stamps.note})"
                 raise ConfigError("topics.clock", why, "set it to auto or log")
         return by_header, []
-    if share_clock([one.stamps for one in chosen.values()]):
-        far = next(iter(chosen.values())).stamps.note
-        why = f"{far} and are of one clock in all streams, as simulated time: they are used"
-        return by_header, [note("header_clock", why)]
+    far = [one.stamps for one in chosen.values() if one.stamps.far_ns is not None]
+    others = [one for one in chosen.values() if one.stamps.far_ns is None]
+    if share_clock(far) and all(one.stamps.note == NO_HEADER for one in others):
+        speed = replay_speed(far[0])
+        goes = f", which goes {speed:.3g} times as fast as log time (a replay at that speed, or a simulation)"
+        if not others:
+            why = f"{far[0].note} and are of one clock in all streams{goes if speed != 1.0 else ', as simulated time'}"
+            return by_header, [note("header_clock", f"{why}: they are used")]
+        if speed != 1.0:
+            without = ", ".join(one.topic for one in others)
+            why = f"{far[0].note} and are of one clock{goes}: they are used, and {without} is put on that clock"
+            return lambda rows: as_replayed(rows, far[0]), [note("header_clock", why)]
     return lambda rows: rows, []
 
 
@@ -246,7 +257,7 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         moved = "the later stamps are moved by that step, which log time shows"
         yield note("clock_set", f"{why}: their clock was set {setting} while recording; {moved}")
     for role, rows in streams:
-        if rows.note and rows.note not in ("no header", BY_LOG):
+        if rows.note and rows.note not in (NO_HEADER, BY_LOG):
             yield note("log_time_used", f"{role}: {rows.note}; log time is used")
         if rows.replaced > 1:
             counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"

@@ -27,6 +27,9 @@ Clock = Literal["header", "log"]
 FEWEST_STAMPS = 2
 """Least number of stamps that show a clock."""
 
+LEAST_CHANGE_OF_SPEED = 0.01
+"""Least difference of the speed of a replay from 1 that is reported. Clocks of computers differ by 0.0001."""
+
 AROUND = 25
 """Number of messages before, and after, a step of a clock: their median delay to log time shows its size."""
 
@@ -81,7 +84,7 @@ def stamp_rows(table: TopicTable) -> StampedRows:
 
     seconds, nanoseconds = (table.integers(*paths) for paths in zip(*STAMPS, strict=True))
     if seconds is None or nanoseconds is None or not len(log_ns):
-        return unusable("no header")
+        return unusable(NO_HEADER)
     header = seconds * 1_000_000_000 + nanoseconds
     zeros = np.count_nonzero(header == 0)
     if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
@@ -109,6 +112,9 @@ def stamp_rows(table: TopicTable) -> StampedRows:
     return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)), table.set_back, clock_set)
 
 
+NO_HEADER = "no header"
+"""Why header stamps are not used where messages have none."""
+
 BY_LOG = "topics.clock is log"
 """Why header stamps are not used where that is configured."""
 
@@ -124,6 +130,29 @@ def share_clock(streams: Sequence[StampedRows]) -> bool:
         if not len(apart) or abs(float(np.median(apart))) > DISORDER_NS:
             return False
     return True
+
+
+def replay_speed(rows: StampedRows) -> float:
+    """Return how fast header stamps far from log time go, relative to log time: the speed of a replay; 1 where unknown.
+
+    Below `LEAST_CHANGE_OF_SPEED` of difference it is 1.
+    """
+    if rows.far_ns is None or len(rows.log_ns) < FEWEST_STAMPS or not (logged := rows.log_ns[-1] - rows.log_ns[0]):
+        return 1.0
+    speed = float((rows.far_ns[-1] - rows.far_ns[0]) / logged)
+    return speed if abs(speed - 1.0) > LEAST_CHANGE_OF_SPEED and speed > 0.0 else 1.0
+
+
+def as_replayed(rows: StampedRows, like: StampedRows) -> StampedRows:
+    """Return stamps by the header; of a stream without header stamps, log times on the clock of those of another."""
+    if rows.note != NO_HEADER:
+        return by_header(rows)
+    log_ns, known = like.log_ns, np.asarray(like.far_ns)
+    inside = np.clip(rows.log_ns, log_ns[0], log_ns[-1])
+    beyond = (replay_speed(like) * (rows.log_ns - inside)).astype(np.int64)
+    return replace(
+        rows, header_ns=known[0] + np.interp(inside, log_ns, known - known[0]).astype(np.int64) + beyond, note=""
+    )
 
 
 def by_header(rows: StampedRows) -> StampedRows:

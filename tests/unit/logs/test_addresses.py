@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -177,10 +177,9 @@ def test_a_server_that_sends_a_byte_now_and_then_is_given_up(kind: str, monkeypa
     pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
     monkeypatch.setenv(SERVER_TIMEOUT_S, "1")
     began = time.monotonic()
+    read: Callable[[UrlPath], object] = find if kind == "a page that lists a folder" else open_log
     with lying_server(SLOW[kind], b"1\r\n\0\r\n", pause_s=0.05) as (url, _), pytest.raises(LogError) as error:
-        if kind == "a page that lists a folder":
-            find(UrlPath(url.replace("a.mcap", "folder/*.mcap")))
-        open_log(UrlPath(url))
+        read(UrlPath(url.replace("a.mcap", "folder/*.mcap") if read is find else url))
     assert "sent nothing for 1 s, or less than 10 kB/s" in str(error.value)
     assert time.monotonic() - began < 15.0
 
@@ -217,7 +216,8 @@ def test_a_body_without_an_end_is_fetched_up_to_the_given_bytes(monkeypatch: pyt
 def test_a_log_without_an_end_on_standard_input_is_one_line(given: tuple[str, str], words: str) -> None:
     command = [sys.executable, "-P", "-m", "icrtool", "info", "-", *given, "-q"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdin is not None and process.stderr is not None
+        assert process.stdin is not None
+        assert process.stderr is not None
         with contextlib.suppress(BrokenPipeError):
             process.stdin.write(b"\x89MCAP0\r\n")
             for _ in range(500):
