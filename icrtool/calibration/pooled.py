@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from os import PathLike
 from typing import Literal, NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec import UNSET
 from msgspec.structs import asdict
 
 from icrtool import __version__
 from icrtool.calibration import held_out
+from icrtool.calibration.other_grounds import leave_grounds_out
 from icrtool.calibration.record import (
     MULTIPLIER_BETWEEN_SHARE,
     Calibration,
@@ -144,8 +146,9 @@ class CalibrationResult(NamedTuple):
 
 
 def calibrate_recordings(
-    recordings: Sequence[Recording], robot: documents.CalibratedRobot | None = None, findings: tuple[Note, ...] = ()
-) -> CalibrationResult:
+    recordings: Sequence[Recording], robot: documents.CalibratedRobot | None = None, findings: tuple[Note, ...] = (),
+    grounds: Sequence[str] = (),
+) -> CalibrationResult:  # fmt: skip
     """Fit the motion models to all recordings, and test each on what it was not fitted to.
 
     Parameters
@@ -153,6 +156,7 @@ def calibrate_recordings(
     recordings : one or many, of one robot
     robot : the robot that the calibration states; default: without a name
     findings : notes that a user needs before use
+    grounds : name of the ground of each recording; with two and more, each ground is left out in turn
 
     Raises
     ------
@@ -172,7 +176,14 @@ def calibrate_recordings(
     turnless = ", ".join(one.name for one in recordings if one.track.gyro is None)
     text = f"no gyro that turns with the robot in {turnless}: wheels alone"
     notes = (note("gyro_not_used", text),) if turnless else ()
-    return CalibrationResult(calibration_from(table, robot, findings), table, notes)
+    calibration = calibration_from(table, robot, findings)
+    if grounds:
+        logs = tuple(
+            msgspec.structs.replace(log, ground=ground) for log, ground in zip(calibration.logs, grounds, strict=True)
+        )
+        scores = leave_grounds_out(recordings, grounds)
+        calibration = msgspec.structs.replace(calibration, logs=logs, other_grounds=scores or UNSET)
+    return CalibrationResult(calibration, table, notes)
 
 
 def calibration_from(
@@ -293,13 +304,14 @@ SAME_SPEED = 1e-6
 """Largest relative difference of two wheel speeds that count as the same."""
 
 
-def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Calibration:
+def calibrate(runs: Run | Sequence[Run] | Mapping[str, Sequence[Run]], *, allow_unusable: bool = False) -> Calibration:
     """Calibrate the motion model of a robot from one run or many, tested on what it was not fitted to.
 
     Parameters
     ----------
     runs : of `icrtool.fit` or `icrtool.open_run`, of one robot; of many, those are left out that are not usable, too
-        short, copies of another, or a part of one
+        short, copies of another, or a part of one. By the name of the ground that they were driven on, each ground is
+        left out in turn: a report with the calibration then answers for another ground
     allow_unusable : take runs that are not usable, too
 
     Raises
@@ -310,21 +322,32 @@ def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Cal
         No run is left, or too short a drive.
     """
     # A string is a sequence, too: a path is refused with its own message.
+    if isinstance(runs, Mapping):
+        grounds = [ground for ground, of_ground in runs.items() for _ in of_ground]
+        every = [run for of_ground in runs.values() for run in of_ground]
+        return calibrate_runs(every, allow_unusable=allow_unusable, grounds=grounds).calibration
     several = [runs] if isinstance(runs, (Run, str, PathLike)) else runs
     return calibrate_runs(several, allow_unusable=allow_unusable).calibration
 
 
-def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> CalibrationResult:
-    """Calibrate as `calibrate` does, with the table of the test; one run at a time is held."""
+def calibrate_runs(
+    runs: Iterable[Run], *, allow_unusable: bool = False, grounds: Iterable[str] = ()
+) -> CalibrationResult:
+    """Calibrate as `calibrate` does, with the table of the test; one run at a time is held.
+
+    `grounds` names the ground of each run, or none.
+    """
+    ground_of = iter(grounds)
     taken: list[_Taken] = []
     left_out: list[LeftOut] = []
     alone: tuple[Note, ...] = ()
     for run in runs:
         check_type(run, Run, MAKE_RUN)
+        ground = next(ground_of, "")
         recording = turning_recording_of(run)
         robot = robot_of(run, recording.width_m)
         positions = run.sensors.fixes.north_m + 1j * run.sensors.fixes.east_m
-        one = _Taken(recording, positions, robot, use_notes(run, alone=False))
+        one = _Taken(recording, positions, robot, use_notes(run, alone=False), ground)
         if why := _why_left_out(run, one, taken, allow_unusable=allow_unusable):
             left_out.append(LeftOut(run.name, why))
             continue
@@ -343,7 +366,8 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
         why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
     known = alone if len(taken) == 1 else tuple(dict.fromkeys(known for one in taken for known in one.notes))
-    return calibrate_recordings(recordings, robots[0], known)._replace(left_out=tuple(left_out))
+    named = [one.ground for one in taken] if all(one.ground for one in taken) else []
+    return calibrate_recordings(recordings, robots[0], known, named)._replace(left_out=tuple(left_out))
 
 
 class _Taken(NamedTuple):
@@ -353,12 +377,14 @@ class _Taken(NamedTuple):
     ----------
     positions : complex (m,), of its fixes, north + i east [m]
     notes : of its use together with other runs
+    ground : name of its ground; empty where none was given
     """
 
     recording: Recording
     positions: Complexes
     robot: documents.CalibratedRobot
     notes: tuple[Note, ...]
+    ground: str
 
 
 def _is_part(one: _Taken, of: _Taken) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options, when_used
-from icrtool.cli.inputs import check_run_config, read_calibration, runs_named, runs_or_logs
+from icrtool.cli.inputs import check_run_config, grounds_of, read_calibration, runs_named
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, PLACE, option
 from icrtool.cli.printing import Printer
 
@@ -32,7 +32,7 @@ LARGEST_PLAN_BYTES = 50_000_000
 
 
 @click.command("calibrate")
-@click.argument("sources", metavar="LOG|RUN|FOLDER...", nargs=-1, required=True, type=options.LOG)
+@click.argument("sources", metavar="[GROUND=]LOG|RUN|FOLDER...", nargs=-1, required=True)
 @option("-o --output", "FILE|DIR", FILE, "Write the calibration file here.")
 @option("--x-icr", "METRES", float, "Forward position of the ICRs, where known: it gives that of the antenna. One log.")
 @option("--plot", "FILE", NEW_PICTURE, "Draw the residuals before and after the calibration: png, svg, pdf. One log.")
@@ -41,7 +41,7 @@ LARGEST_PLAN_BYTES = 50_000_000
 @options.INPUT_LIMITS
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def calibrate_command(
-    sources: tuple[Path, ...],
+    sources: tuple[str, ...],
     output: Path | None,
     x_icr: float | None,
     plot: Path | None,
@@ -55,32 +55,35 @@ def calibrate_command(
     predicted by a fit to the rest of the drive; position of the antenna, heading offset, delays and wheel scales are
     estimated as well. A RUN keeps the configuration that it was fitted with. A FOLDER stands for
     the runs in it, or else for its logs. Logs that are not usable, too short, copies or a part of another are left out.
+    With GROUND= before each, each ground is left out in turn too: a report with this calibration then answers how far
+    the robot gets on another ground. The folder of a batch, given alone, has the groups of its manifest as grounds.
 
     \b
     Example:
       icrtool calibrate field.mcap --robot husky-a200
       icrtool calibrate monday.mcap tuesday.mcap --robot warthog -o warthog.json
       icrtool calibrate icrtool-runs -o calibration.json
+      icrtool calibrate grass=may/ gravel=june/ -o warthog.json
     """  # noqa: D301 - click reads the escape
     config = settings.load()
-    sources = tuple(one for source in sources for one in runs_or_logs(source))
-    if len(sources) > 1 and (plot is not None or x_icr is not None):
+    places, grounds = grounds_of(sources)
+    if len(places) > 1 and (plot is not None or x_icr is not None):
         raise click.UsageError("--plot and --x-icr are for one log")
     if output is not None:
         formats.calibration_file(output)
-    if plot is not None and run_directory.is_run_directory(sources[0]):
+    if plot is not None and run_directory.is_run_directory(places[0]):
         # A run may come from a stranger: no file or address is read because it names one.
-        raise errors.RunError(sources[0], "--plot draws the residuals of a log, not of a run", "name its log")
-    if all(run_directory.is_run_directory(source) for source in sources):
+        raise errors.RunError(places[0], "--plot draws the residuals of a log, not of a run", "name its log")
+    if all(run_directory.is_run_directory(place) for place in places):
         check_run_config(config)
-    runs = runs_named(sources, config, printer)
+    runs = runs_named(places, config, printer)
     sensors = None
     if len(runs) == 1:
         printer.warn_of(runs[0])
         sensors = sensor_findings.calibrate_log(runs[0], x_icr_m=x_icr)
     result = None
     try:
-        result = pooled.calibrate_runs(runs, allow_unusable=allow_unusable)
+        result = pooled.calibrate_runs(runs, allow_unusable=allow_unusable, grounds=grounds)
         printer.warn(map(str, result.left_out))
     except errors.IcrToolError as err:
         if sensors is None or not (runs[0].usable or allow_unusable):
@@ -93,7 +96,7 @@ def calibrate_command(
     if output is not None and document is not None:
         texts.append(f"written to {formats.write_calibration(document, output)}")
     if plot is not None:
-        _draw_residuals(sources[0], runs[0], plot)
+        _draw_residuals(places[0], runs[0], plot)
         texts.append(f"drawn to {plot}")
     printer.json("calibrate", {"calibration": document})
     printer.show(tables.calibration_blocks(result, sensors))

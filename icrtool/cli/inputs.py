@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -10,8 +11,8 @@ import click
 
 from icrtool.cli import when_used
 from icrtool.cli.printing import Printer
-from icrtool.records.places import UrlPath
-from icrtool.records.text import escaped
+from icrtool.records.places import UrlPath, place_of
+from icrtool.records.text import LogText, escaped
 
 with when_used():
     from icrtool import errors
@@ -129,3 +130,67 @@ def read_calibration(source: Path | None, *, force: bool = False, advice: str = 
         why = f"its ICRs are not usable: {run.document.unusable_because}"
         raise errors.DataError(run.name, why, f"drive again, with turns to both sides{advice}")
     return run.name, pooled.calibrate(run, allow_unusable=force)
+
+
+def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
+    """Return the places of each group; the only argument may be the folder of a batch, which has groups of its own.
+
+    Raises
+    ------
+    ConfigError
+        There is only one group.
+    RunError
+        The table of the batch cannot be read.
+    """
+    places: dict[LogText, list[Path]] = {}
+    for source in sources:
+        name, path = named_place(source)
+        if len(sources) == 1 and fleet_files.is_fleet(path):
+            places = {LogText(group): runs for group, runs in fleet_files.runs_of_fleet(path).items()}
+        else:
+            places.setdefault(name, []).extend(_expanded(path))
+    if len(places) < 2:
+        raise errors.ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
+    return places
+
+
+def _expanded(place: Path) -> list[Path]:
+    """Return what a pattern names, which a shell does not expand behind ``NAME=``; else the place itself."""
+    if isinstance(place, UrlPath) or place.exists() or not glob.has_magic(str(place)):
+        return [place]
+    found = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute
+    return [Path(one) for one in found] or [place]
+
+
+def named_place(source: str) -> tuple[LogText, Path]:
+    """Return the group's name and the place of one argument of ``compare``."""
+    whole = place_of(source)
+    name, sign, place = source.partition("=")
+    # An address may have an equals sign in its query.
+    if sign and name and place and not isinstance(whole, UrlPath) and not whole.exists():
+        return LogText(name), place_of(place)
+    return LogText(whole.name or str(whole)), whole
+
+
+def grounds_of(sources: tuple[str, ...]) -> tuple[list[Path], list[str]]:
+    """Return the runs and logs of ``calibrate``, and the name of the ground of each; no names where none was given.
+
+    The only argument may be the folder of a batch, whose groups are the grounds.
+
+    Raises
+    ------
+    ConfigError
+        Some arguments have the name of a ground and others have not.
+    RunError
+        The table of the batch cannot be read.
+    """
+    places = [named_place(source) for source in sources]
+    named = [place_of(source) != path for source, (_, path) in zip(sources, places, strict=True)]
+    if len(places) == 1 and not named[0] and fleet_files.is_fleet(places[0][1]):
+        found = [(name, run) for name, runs in fleet_files.runs_of_fleet(places[0][1]).items() for run in runs]
+        return [run for _, run in found], [str(name) for name, _ in found]
+    if any(named) and not all(named):
+        without = escaped(str(places[named.index(False)][1]))
+        raise errors.ConfigError(without, "has no name of a ground", "write NAME= before each argument, or before none")
+    found = [(str(name), one) for name, place in places for path in _expanded(place) for one in runs_or_logs(path)]
+    return [one for _, one in found], [name for name, _ in found] if all(named) else []

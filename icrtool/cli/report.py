@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from icrtool.cli.inputs import (
     ResultPlace,
     RunPlace,
     check_run_config,
+    groups_of,
     is_log,
     run_directories,
     runs_named,
@@ -23,14 +23,12 @@ from icrtool.cli.inputs import (
 )
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, flag, option
 from icrtool.cli.printing import Inputs, Printer
-from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of
-from icrtool.records.text import LogText
+from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
 
 with when_used():
     from icrtool import errors
     from icrtool.calibration import transfer
     from icrtool.dropout_analysis import dropout_report as analysis
-    from icrtool.fleet import fleet_files
     from icrtool.output import run_directory
     from icrtool.output.files import atomic, formats
     from icrtool.output.page import pages, render
@@ -211,43 +209,3 @@ def compare_command(
         formats.save_picture(transfer_figure(compared), plot)
     printer.json("compare", compared)
     printer.show(tables.transfer_blocks(compared))
-
-
-def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
-    """Return the places of each group; the only argument may be the folder of a batch, which has groups of its own.
-
-    Raises
-    ------
-    ConfigError
-        There is only one group.
-    RunError
-        The table of the batch cannot be read.
-    """
-    places: dict[LogText, list[Path]] = {}
-    for source in sources:
-        name, path = named_place(source)
-        if len(sources) == 1 and fleet_files.is_fleet(path):
-            places = {LogText(group): runs for group, runs in fleet_files.runs_of_fleet(path).items()}
-        else:
-            places.setdefault(name, []).extend(_expanded(path))
-    if len(places) < 2:
-        raise errors.ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
-    return places
-
-
-def _expanded(place: Path) -> list[Path]:
-    """Return what a pattern names, which a shell does not expand behind ``NAME=``; else the place itself."""
-    if isinstance(place, UrlPath) or place.exists() or not glob.has_magic(str(place)):
-        return [place]
-    found = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute
-    return [Path(one) for one in found] or [place]
-
-
-def named_place(source: str) -> tuple[LogText, Path]:
-    """Return the group's name and the place of one argument of ``compare``."""
-    whole = place_of(source)
-    name, sign, place = source.partition("=")
-    # An address may have an equals sign in its query.
-    if sign and name and place and not isinstance(whole, UrlPath) and not whole.exists():
-        return LogText(name), place_of(place)
-    return LogText(whole.name or str(whole)), whole

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from msgspec import UNSET
 from msgspec.structs import astuple
 
 from icrtool import __version__
+from icrtool.calibration.other_grounds import other_ground_ends
 from icrtool.calibration.pooled import predictor, turning_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, compare_models
@@ -32,6 +33,7 @@ from icrtool.kernels.error_statistics import (
 )
 from icrtool.kernels.open_loop import TOLERANCE_M
 from icrtool.logs.topic_poses import read_topic_poses
+from icrtool.motion.models import RECOMMENDED
 from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import DEFAULT_SEED, BudgetDistance, Gate, Verdict
 from icrtool.records.calibration_document import CalibrationFile
@@ -41,7 +43,7 @@ from icrtool.records.notes import Note, warnings_of
 from icrtool.records.plain_data import plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import ReportRequest
-from icrtool.records.rows import TOPIC_ROW, kind_of
+from icrtool.records.rows import TOPIC_ROW, kind_of, turned_by
 from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
 from icrtool.records.text import distance_text
 from icrtool.records.topic_poses import TopicPoses
@@ -252,7 +254,9 @@ def report_on(
         examples=examples,
         worst=shown_paths.worst_trials(compared, found, starts=request.starts, further=of_topics),
         outages=(*forced, *shown_paths.real_outages(compared)),
-        budgets=tuple(one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)),
+        budgets=with_other_grounds(
+            [one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)], used
+        ),
         gates=tuple(
             report.verdict_on(gate, run.name, passed=False, unusable=unusable)
             if unusable
@@ -418,6 +422,30 @@ def _ladder(
 def forced_lengths_s(run: Run, request: ReportRequest) -> Sequence[float]:
     """Return the lengths [s] of outages to force: from the request, else from the run's configuration."""
     return request.outage_s if request.outage_s is not None else run.config.dropout.forced_outage_s
+
+
+def with_other_grounds(
+    budgets: Iterable[BudgetDistance], calibrations: Sequence[UsedCalibration]
+) -> tuple[BudgetDistance, ...]:
+    """Return distances within budgets with their ends on another ground, of rows that come from calibrations."""
+    scores = {
+        one.name: one.calibration.other_grounds or ()
+        for one in calibrations
+        if one.calibration is not None and not one.fitted_to_this
+    }
+    # row ``adaptive`` begins with the first calibration that was not fitted to this log
+    first = next(iter(scores.values()), ())
+    found = []
+    for one in budgets:
+        by, kind = turned_by(one.model), kind_of(one.model)
+        row = f"{RECOMMENDED if kind == 'calibration' else kind}{f'_{by}' if by else ''}"
+        of_row = {"calibration": scores.get(one.model, ()), "adaptive": first}.get(kind, ())
+        ends = other_ground_ends(of_row, row, one.budget_m)
+        if ends is None:
+            found.append(one)
+        else:
+            found.append(msgspec.structs.replace(one, other_low_m=ends[0], other_high_m=ends[1]))
+    return tuple(found)
 
 
 def _calibration_rows(

@@ -72,6 +72,7 @@ class Spread(NamedTuple):
     shift : mean of the next drive's logarithm over this one's: numbers that were fitted to a drive fit it best
     between : standard deviation between long drives
     horizon_std : standard deviation of a drive as long as one horizon; the variance falls with the length of the drive
+    grounds : standard deviation between kinds of ground, of numbers that were fitted to other grounds
 
     Notes
     -----
@@ -81,6 +82,7 @@ class Spread(NamedTuple):
     shift: float
     between: float
     horizon_std: float
+    grounds: float
 
 
 class Intervals(NamedTuple):
@@ -204,6 +206,26 @@ def between_variance(values: Floats, variances: Floats) -> float:
     squares = float(weights @ (values - mean) ** 2)
     scale = float(weights.sum() - weights @ weights / weights.sum())
     return max((squares - (len(values) - 1.0)) / scale, 0.0)
+
+
+def ground_interval(p95_m: Floats, known_std: float) -> tuple[float, float]:
+    """Return the interval of p95 on a further ground [m], with `NEXT_LEVEL`, from p95 on k >= 2 grounds (k,) [m].
+
+    Parameters
+    ----------
+    known_std : standard deviation of the logarithm between grounds, of other robots
+
+    Notes
+    -----
+    Prediction interval of a normal logarithm, Student's t; the variance between the grounds is pooled with the variance
+    of other robots (`pooled_variance`).
+    """
+    logarithms = np.log(p95_m)
+    measured = float(logarithms.var(ddof=1))
+    variance, freedom = pooled_variance(measured, len(p95_m) - 1.0, known_std**2)
+    half = student_factor(freedom, NEXT_NORMAL_FACTOR) * math.sqrt(variance * (1.0 + 1.0 / len(p95_m)))
+    middle = float(logarithms.mean())
+    return math.exp(middle - half), math.exp(middle + half)
 
 
 def error_intervals(

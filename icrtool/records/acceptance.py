@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import math
 
+from msgspec import UNSET, UnsetType
+
 from icrtool.records.plain_data import Record
 
 DEFAULT_SEED = 20140311
 """Seed of random draws. Its value is arbitrary; it is the same for every run and every model."""
+
+OTHER_GROUND_LAST_M = 20.0
+"""Longest distance of the errors on other grounds [m]."""
 
 CHOICE_HORIZON_M = 10.0
 """Distance of the errors in headlines, tables of calibrations and lists of the worst trials [m]."""
@@ -41,6 +46,8 @@ class BudgetDistance(Record, frozen=True):
     low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; None where
         they stay within it, and where there is no interval
     next_low_m, next_high_m : these distances for the next drive of this robot on this kind of ground, in 9 of 10 cases
+    other_low_m, other_high_m : these distances on a ground that the calibration was not fitted to, in 9 of 10 cases;
+        missing where its grounds were not given
     """
 
     model: str
@@ -54,6 +61,18 @@ class BudgetDistance(Record, frozen=True):
     next_high_m: float | None = None
     without_events_m: float | None = None
     beyond_without_events: bool = False
+    other_low_m: float | UnsetType | None = UNSET
+    other_high_m: float | UnsetType | None = UNSET
+
+    @property
+    def other_text(self) -> str:
+        """As `next_text`, on another ground; empty where nothing is known of it."""
+        if self.other_low_m is UNSET or self.other_high_m is UNSET:
+            return ""
+        if self.other_low_m is None:
+            return f"more than {OTHER_GROUND_LAST_M:g} m"
+        low = f"{self.other_low_m:.1f}"
+        return f"{low} m or more" if self.other_high_m is None else f"{low}-{self.other_high_m:.1f} m"
 
     @property
     def short_text(self) -> str:

@@ -60,6 +60,7 @@ class CalibrationLog(Record, frozen=True):
     heading_offset_deg : offset of its reference's heading; wheels_delay_s : delay of its wheels with respect to its
         poses, positive where the wheels lag
     begin_ns : stamp of its first state; 0 where it is not known
+    ground : name of its ground, where one was given
     """
 
     name: str
@@ -69,6 +70,17 @@ class CalibrationLog(Record, frozen=True):
     heading_offset_deg: float
     wheels_delay_s: float
     begin_ns: int = 0
+    ground: str | UnsetType = UNSET
+
+
+class GroundScore(Record, frozen=True):
+    """Errors [m] of a model on the logs of one ground, with numbers that were fitted to the other grounds."""
+
+    model: str
+    horizon_m: float
+    p95_m: float
+    expected_m: float
+    ground: str
 
 
 class ControllerErrors(Record, frozen=True):
@@ -219,7 +231,8 @@ class CalibrationDocument(CalibrationFile, frozen=True, kw_only=True):
     """A calibration file.
 
     `created`: date and time, UTC, ISO 8601; not in a report's ``recommended``, which is the same whenever it is made.
-    `held_out_pooled`: scores of all held-out trials together. `error_sources`: null where the drive is too short.
+    `held_out_pooled`: scores of all held-out trials together. `other_grounds`: scores on each ground, left out in turn;
+    missing where the grounds were not given. `error_sources`: null where the drive is too short.
     """
 
     tool_version: str
@@ -240,6 +253,7 @@ class CalibrationDocument(CalibrationFile, frozen=True, kw_only=True):
     logs: tuple[CalibrationLog, ...]
     held_out: tuple[HeldOutScore, ...]
     held_out_pooled: tuple[PooledScore, ...]
+    other_grounds: tuple[GroundScore, ...] | UnsetType = UNSET
     error_sources: ErrorSources | None
     notes: tuple[Note, ...]
     warnings: tuple[str, ...]

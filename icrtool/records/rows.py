@@ -31,13 +31,13 @@ INSTALLATION = "sensors corrected by all of the drive"
 """In `knows`: conventions, heading offset, delays, scales and sensor noise come from all of the drive."""
 
 
-FITTED_SPREAD = Spread(shift=0.3, between=0.45, horizon_std=1.0)
+FITTED_SPREAD = Spread(shift=0.3, between=0.45, horizon_std=1.0, grounds=0.7)
 """Spread of p95 between drives, of rows whose numbers were fitted to the drive and turn by the wheels."""
 
-GIVEN_SPREAD = Spread(shift=0.0, between=0.45, horizon_std=0.95)
+GIVEN_SPREAD = Spread(shift=0.0, between=0.45, horizon_std=0.95, grounds=0.55)
 """Spread of p95 between drives, of rows whose numbers do not depend on the rest of the drive."""
 
-TURNED_SPREAD = Spread(shift=0.0, between=0.15, horizon_std=0.75)
+TURNED_SPREAD = Spread(shift=0.0, between=0.15, horizon_std=0.75, grounds=0.3)
 """Spread of p95 between drives, of rows that turn by a gyro or a measured heading."""
 
 TOPIC_ROW = "topic"

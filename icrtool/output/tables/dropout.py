@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import suppress
 
@@ -50,6 +51,7 @@ from icrtool.records.rows import (
     kind_of,
     row_of,
     shown_rows,
+    turned_by,
 )
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
@@ -57,7 +59,7 @@ from icrtool.records.text import counted, distance_text, shortened
 ReachRow = tuple[str, str, str, str]
 
 NEXT_DRIVE = "next drive, 9 of 10"
-NEXT_DRIVE_MEANS = "next drive: this robot, this kind of ground; another ground is not shown"
+NEXT_DRIVE_MEANS = "next drive: this robot, this kind of ground"
 
 
 def format_dropout(report: DropoutReport) -> str:
@@ -157,24 +159,43 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
     """Return how far the robot stays within each budget, on this drive and on the next one."""
     blocks: list[Block] = []
     lead, text = "", ""
+    others_known = list(other_ground_lines(report))
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows, others = reach_rows(report, budget_m, len(summary.events))
         if rows and not lead:
             name, lead, next_drive, _ = rows[0]
             then = f"; on the next drive on this ground {next_drive} (9 of 10)" if next_drive else ""
             text = f"within {budget_m:g} m (95 %) on this drive, by wheel speeds alone with {name}{then}"
-            text += "".join(f"; {line}" for line in heading_lines(report))
+            text += "".join(f"; {line}" for line in (*others_known[:1], *heading_lines(report)))
         shown = [(shortened(name, LONGEST_ROW_NAME), *rest) for name, *rest in rows]
         head = (f"within {budget_m:g} m (95 %)", "this drive", NEXT_DRIVE, "")
         blocks.append(Table("lrrl", shown, head, "How far without GNSS?"))
         blocks.append(Section("Other models", [Table("lrrl", others, head)], VERBOSE))
     if blocks:
-        blocks += [*heading_lines(report), *as_good_lines(report), NEXT_DRIVE_MEANS]
+        meaning = NEXT_DRIVE_MEANS if others_known else f"{NEXT_DRIVE_MEANS}; another ground is not shown"
+        blocks += [*heading_lines(report), *as_good_lines(report), *others_known, meaning]
     else:
         blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
         blocks.append(Facts([("left out", f"recommended, controller: {report.ladder.left_out}")]))
     return Section("How far without GNSS?", blocks, lead=lead, text=text)
+
+
+def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
+    """Yield how far the robot stays within each budget on a ground that the calibration was not fitted to."""
+    grounds = {
+        score.ground
+        for used in report.calibrations
+        if used.calibration is not None
+        for score in used.calibration.other_grounds or ()
+    }
+    for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
+        known = [one for one in report.budgets if one.budget_m == budget_m and one.other_text]
+        wheels = [one for one in known if not turned_by(one.model)]
+        if wheels:
+            best = max(wheels, key=lambda one: math.inf if one.other_low_m is None else one.other_low_m or 0.0)
+            of_budget = f"{best.other_text} within {budget_m:g} m (9 of 10) with {best.model}"
+            yield f"on another ground: {of_budget}; from {counted(len(grounds), 'ground')}, each left out once"
 
 
 def heading_lines(report: DropoutDocument) -> Iterator[str]:

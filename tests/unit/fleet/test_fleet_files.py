@@ -10,8 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from icrtool.cli.batch import line_of, summary_of
-from icrtool.cli.inputs import runs_or_logs
-from icrtool.cli.report import groups_of
+from icrtool.cli.inputs import groups_of, runs_or_logs
 from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import (
     calibrations_text,

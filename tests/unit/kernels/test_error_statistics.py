@@ -21,10 +21,10 @@ from icrtool.kernels.error_statistics import (
 )
 
 STATES_PER_M = 40  # of the drives made here
-STEADY = Spread(0.0, 0.3, 0.5)
+STEADY = Spread(0.0, 0.3, 0.5, 0.6)
 """What drives along steady noise have, as `errors_along` makes them: 0.43 to 0.50 for paths of 6 to 60 horizons."""
 
-WANDERING = Spread(0.0, 0.3, 1.1)
+WANDERING = Spread(0.0, 0.3, 1.1, 0.6)
 """The same where the noise wanders over four horizons: 0.95 to 1.20."""
 
 OF_THE_WIDTH = 0.3  # other trials and blocks, against the width of the interval

@@ -21,7 +21,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
-from icrtool.cli.report import named_place
+from icrtool.cli.inputs import named_place
 from icrtool.config import load_config
 from icrtool.errors import LogError
 from icrtool.fleet.fleet_files import _content

@@ -1,0 +1,119 @@
+"""Errors on a ground that a calibration was not fitted to: each group of recordings left out in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from icrtool.calibration.adaptive_rows import adapt
+from icrtool.calibration.held_out import GYRO_SUFFIX, errors_without, fit_models
+from icrtool.errors import DataError
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.error_statistics import error_summary, ground_interval, within_budget
+from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model
+from icrtool.motion.recording import LogConstants, Recording, Trials, cut_trials, cut_windows
+from icrtool.motion.robot_prior import prior_of_model
+from icrtool.motion.window_fit import Fold, PooledFit, own_constants
+from icrtool.records.acceptance import CHOICE_HORIZON_M, OTHER_GROUND_LAST_M
+from icrtool.records.calibration_document import GroundScore
+from icrtool.records.rows import row_of
+
+GROUND_HORIZONS_M = (1.0, 2.0, 3.0, 5.0, 7.0, CHOICE_HORIZON_M, 15.0, OTHER_GROUND_LAST_M)
+"""Distances of the errors on other grounds [m]."""
+
+FEWEST_GROUNDS = 2
+"""Number of grounds from which on each can be left out."""
+
+
+def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -> tuple[GroundScore, ...]:
+    """Return the errors on each ground of the numbers that were fitted to all other grounds.
+
+    Parameters
+    ----------
+    recordings : of one robot
+    grounds : name of the ground of each recording
+
+    Returns
+    -------
+    Empty for fewer than `FEWEST_GROUNDS`. A ground without trials, or without which too short a drive is left, has no
+    score.
+    """
+    found: list[GroundScore] = []
+    names = list(dict.fromkeys(grounds))
+    if len(names) < FEWEST_GROUNDS:
+        return ()
+    for ground in names:
+        others = [one for one, of in zip(recordings, grounds, strict=True) if of != ground]
+        mine = [one for one, of in zip(recordings, grounds, strict=True) if of == ground]
+        with suppress(DataError):
+            found += _scores(ground, mine, fit_models(others, (FIVE, RECOMMENDED)))
+    return tuple(found)
+
+
+def _scores(ground: str, recordings: Sequence[Recording], fits: Mapping[str, PooledFit]) -> Iterator[GroundScore]:
+    """Yield the errors in the recordings of a ground, by row and distance."""
+    errors: dict[str, list[Floats]] = {}
+    for one in recordings:
+        for name, position in _errors(one, cut_trials(one, GROUND_HORIZONS_M), fits):
+            errors.setdefault(name, []).append(position)
+    for name, parts in errors.items():
+        if len(parts) < len(recordings):
+            continue
+        summary = error_summary(np.concatenate(parts))
+        for h, horizon_m in enumerate(GROUND_HORIZONS_M):
+            if summary.trials[h]:
+                yield GroundScore(name, horizon_m, float(summary.p95[h]), float(summary.expected[h]), ground)
+
+
+def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit]) -> Iterator[tuple[str, Floats]]:
+    """Yield rows and their errors (k, h) [m] in trials of a recording."""
+    turned = fits.get(f"{RECOMMENDED}{GYRO_SUFFIX}")
+    has_gyro = turned is not None and recording.track.gyro is not None
+    windows = cut_windows(recording)
+    for suffix in ("", GYRO_SUFFIX) if has_gyro else ("",):
+        five, eight = (fits[f"{name}{suffix}"].fitted for name in (FIVE, RECOMMENDED))
+        for name, fitted in (
+            (CONTROLLER, controller_model(five, recording.lever, recording.width_m)), (RECOMMENDED, eight),
+        ):  # fmt: skip
+            yield f"{name}{suffix}", _held(recording, trials, fitted, own_constants(windows, fitted, recording.width_m))
+    gyro_model = turned.fitted if turned is not None else None
+    drive = adapt(recording, prior_of_model(recording.width_m, fits[RECOMMENDED].fitted, gyro_model, "other grounds"))
+    yield "adaptive", drive.errors(trials).position
+    if has_gyro:
+        yield f"adaptive{GYRO_SUFFIX}", drive.errors(trials, turned=True).position
+
+
+def _held(recording: Recording, trials: Trials, fitted: FittedModel, own: LogConstants) -> Floats:
+    """Return the errors (k, h) [m] of a model that is held as it is."""
+    return errors_without(recording, trials, [Fold("", 0, 0, -np.inf, np.inf)], 0, lambda _: (fitted, own)).position
+
+
+def other_ground_ends(
+    scores: Sequence[GroundScore], row: str, budget_m: float
+) -> tuple[float | None, float | None] | None:
+    """Return between which distances [m] a row stays within a budget on a ground that is not among those left out.
+
+    Parameters
+    ----------
+    scores : of `leave_grounds_out`
+    row : its name there
+
+    Returns
+    -------
+    Ends of the 9-of-10 interval; None for an end that stays within the budget at every horizon. None where fewer than
+    `FEWEST_GROUNDS` grounds have the row.
+    """
+    spread_std = row_of(row).spread.grounds
+    by_horizon: dict[float, list[float]] = {}
+    for one in scores:
+        if one.model == row and one.p95_m > 0.0:
+            by_horizon.setdefault(one.horizon_m, []).append(one.p95_m)
+    known = {metres: p95_m for metres, p95_m in sorted(by_horizon.items()) if len(p95_m) >= FEWEST_GROUNDS}
+    if not known:
+        return None
+    ends = np.array([ground_interval(np.array(p95_m), spread_std) for p95_m in known.values()])
+    reached = [within_budget(np.array(list(known)), ends[:, column], budget_m) for column in (1, 0)]
+    low, high = (None if one is None or one[1] else one[0] for one in reached)
+    return low, high
