@@ -124,17 +124,17 @@ def _verdict(
 ) -> str:
     """Return one sentence: how the multiplier differs, and what the calibration of the first costs on the second."""
     one = next(one for one in parameters if one.quantity == "multiplier")
-    change = f"by {with_std(one.difference, one.std)}"
+    change = with_std(one.difference, one.std)
+    differs = f"The multiplier of {second} differs from the multiplier of {first} by {change}"
     if not one.significant:
-        change += ", which may be chance"
-    differs = f"The multiplier of {second} differs from the multiplier of {first} {change}"
+        differs = f"No difference of the multipliers of {second} and {first} is shown: {change}"
     if cost.p95_m is None:
         return f"{differs}."
     low, high = cost.p95_low_m, cost.p95_high_m
-    sentence = f"costs {with_interval(cost.p95_m, low, high)} at 95 % after {CHOICE_HORIZON_M:g} m on {second}"
+    size = f"{with_interval(cost.p95_m, low, high)} at 95 % after {CHOICE_HORIZON_M:g} m"
     if low is not None and high is not None and low <= 0.0 <= high:
-        sentence += ", which may be chance"
-    return f"{differs}; a calibration of {first} {sentence}."
+        return f"{differs}; no cost of a calibration of {first} on {second} is shown: {size}."
+    return f"{differs}; a calibration of {first} costs {size} on {second}."
 
 
 class _Tested(NamedTuple):

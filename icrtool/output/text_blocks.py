@@ -83,6 +83,7 @@ class Table(NamedTuple):
     moments : times at which the rows begin [s], which a page shows on its map; empty: none
     search : for each row the `words` that a page searches, and by name the values for its lists of choices. A page also
         sorts such a table; empty: it does neither
+    folded : names of the columns that a page shows only when they are asked for
     """
 
     align: str
@@ -91,6 +92,7 @@ class Table(NamedTuple):
     caption: str = ""
     moments: Sequence[float] = ()
     search: Sequence[Mapping[str, str]] = ()
+    folded: Sequence[str] = ()
 
     def sides(self) -> str:
         """Return ``l`` or ``r`` for every column."""

@@ -109,6 +109,55 @@ def test_nothing_is_wider_than_a_phone(chrome: Browser, file: Path) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
 
 
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_the_first_screen_has_a_picture_and_no_cut_number(chrome: Browser, file: Path, width: int, height: int) -> None:
+    page = chrome.page(width=width, height=height)
+    page.open(file)
+    assert page.evaluate("document.querySelector('.sketch svg').getBoundingClientRect().bottom") < height
+    table = "document.querySelector('.card.reach .scroll')"
+    assert page.evaluate(f"{table}.scrollWidth - {table}.clientWidth") <= 0
+    empty = (
+        "[...document.querySelectorAll('.card')].filter((one) => !one.querySelector('p, ul, dl, table, svg')).length"
+    )
+    assert page.evaluate(empty) == 0
+
+
+def test_a_button_copies_the_configuration(chrome: Browser, file: Path) -> None:
+    page = chrome.page()
+    page.open(file)
+    shown = page.evaluate("document.querySelector('#controller pre').textContent")
+    assert "wheel_separation_multiplier:" in shown
+    # The clipboard of a headless browser is not the system's: what the page hands over is kept.
+    page.evaluate("navigator.clipboard.writeText = (text) => { window.copied = text; return Promise.resolve(); }; null")
+    page.click(*centre(page, "#controller button.copy"))
+    assert page.evaluate("window.copied") == shown
+    assert page.evaluate("document.querySelector('#controller button.copy').textContent") == "Copied"
+    page.evaluate("navigator.clipboard.writeText = () => Promise.reject(new Error('forbidden')); null")
+    page.evaluate("document.addEventListener('copy', () => { window.selected = String(getSelection()); }); null")
+    page.click(*centre(page, "#controller button.copy"))
+    assert page.evaluate("window.selected").strip() == shown.strip()
+
+
+def test_the_configuration_is_not_cut(chrome: Browser, file: Path) -> None:
+    for width in (1280, 390):
+        page = chrome.page(width=width, height=800)
+        page.open(file)
+        assert (
+            page.evaluate("(one => one.scrollWidth - one.clientWidth)(document.querySelector('#controller pre'))") <= 0
+        )
+
+
+def test_show_zooms_to_the_trial(chrome: Browser, file: Path) -> None:
+    page = chrome.page()
+    page.open(file)
+    length = (
+        "(p => Math.hypot(p[0][0] - p[1][0], p[0][1] - p[1][1]))([0, 50].map((row) => icrtoolPage.map().pixelsOf(row)))"
+    )
+    before = page.evaluate(length)
+    page.evaluate("document.querySelector('.at-moment').click()")
+    assert page.evaluate(length) > 1.2 * before
+
+
 def test_the_policy_stops_what_a_page_would_load(chrome: Browser, file: Path) -> None:
     page = chrome.page()
     page.open(file)
@@ -467,6 +516,27 @@ def test_a_phone_shows_multiplier_and_distance_of_the_robot_without_scrolling(ch
     cells = page.evaluate("[...document.querySelectorAll('#table td')].map((one) => one.textContent)")
     assert {"not usable", "8.0\u00a0m", ">\u00a020.0\u00a0m"} <= {one.replace("> ", ">\u00a0") for one in cells}
     assert "1 cannot" in page.evaluate("document.querySelector('header').textContent")
+
+
+def test_the_table_of_a_fleet_has_date_duration_and_distance_without_scrolling(chrome: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    errors = {
+        f"{row}_p95_10m_m": 10.25 for row in ("controller", "recommended", "adaptive", "icr", "vendor", "no_slip")
+    }
+    long = {**LOG, "log": "season/2024-05-01/field_north_of_the_barn.mcap", "errors": LOG["errors"] | errors}
+    file.write_text(
+        page_of_fleet({**FLEET, "logs": [long, {**long, "robot": "husky-a200"}]}, tmp_path), encoding="utf-8"
+    )
+    page = chrome.page(width=1280, height=800)
+    page.open(file)
+    visible = "[...document.querySelectorAll('#table thead th')].filter((one) => one.getClientRects().length)"
+    heads = f"{visible}.map((one) => one.textContent)"
+    shown = page.evaluate(heads)
+    assert {"start", "duration", "distance", "error, recommended", "multiplier"} <= set(shown)
+    assert "error, icr" not in shown
+    assert page.evaluate(f"Math.max(...{visible}.map((one) => one.getBoundingClientRect().right))") <= 1280
+    page.evaluate("document.getElementById('all-columns').click()")
+    assert "error, icr" in page.evaluate(heads)
 
 
 def test_the_table_of_a_fleet_sorts_and_filters(chrome: Browser, tmp_path: Path) -> None:

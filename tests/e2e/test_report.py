@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.output.tables.calibration import change_sentence
+from icrtool.output.tables.calibration import change_sentence, comparison_title
 from icrtool.pipeline import fit
 from icrtool.records.calibration_document import (
     CalibrationLog,
@@ -197,6 +197,9 @@ def test_the_smallest_change_that_would_be_seen_follows_from_the_interval(low: f
     )
     text = change_sentence(pair, found)
     assert words in text
+    heading = comparison_title(found)
+    assert words.partition(";")[0] in heading.text
+    assert "would not have been seen" in heading.facts
     # A true change of this size is beyond the interval in four of five comparisons, of normal errors.
     smallest = float(text.rpartition("a change below ")[2].split(" m")[0])
     drawn = np.random.default_rng(1).normal(smallest, (high - low) / 2 / 1.96, 20_000)

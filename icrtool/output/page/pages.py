@@ -19,18 +19,20 @@ from icrtool.calibration.record import Calibration
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import with_smoothed_reference
 from icrtool.errors import RunError
-from icrtool.motion.models import MODELS
+from icrtool.motion.models import CONTROLLER, MODELS
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
 from icrtool.output.figure_catalogue import drive_charts
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS, drive_data, row_look
 from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
+from icrtool.output.page.sketch import drive_sketch, geometry_sketch
 from icrtool.output.run_directory import PAGE_FILE, check_sum, is_page
-from icrtool.output.tables.calibration import calibration_file_blocks, transfer_blocks
+from icrtool.output.tables.calibration import calibration_file_blocks, comparison_title, transfer_blocks
 from icrtool.output.tables.configuration import format_settings
 from icrtool.output.tables.dropout import (
     answer_sections,
+    controller_section,
     model_section,
     outage_blocks,
     verdict_lines,
@@ -39,7 +41,7 @@ from icrtool.output.tables.dropout import (
 )
 from icrtool.output.tables.errors import errors_section
 from icrtool.output.tables.run import advice, streams_section, unusable_line
-from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Line, Section, Table, Title
+from icrtool.output.text_blocks import PAGE, Block, Cell, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import (
     GLOSSARY,
     driven_text,
@@ -57,13 +59,14 @@ from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
 from icrtool.records.notes import is_grave, warnings_of
 from icrtool.records.places import is_regular
-from icrtool.records.rows import IN_CSV, rows_of, shown_rows
+from icrtool.records.rows import IN_CSV, MOST_USEFUL, WITHOUT_IT, rows_of, shown_rows
 from icrtool.records.run import ICR_WORDS, Run, check_type
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text
 
 VENDOR = ("vendor/uPlot.iife.min.js", "vendor/d3-subset.min.js")
-SCRIPTS = (*VENDOR, "columns.js", "open_loop.js", "charts.js", "map.js", "run.js")
+COPY = "copy.js"
+SCRIPTS = (*VENDOR, "columns.js", "open_loop.js", "charts.js", "map.js", "run.js", COPY)
 
 
 def write_page(
@@ -120,10 +123,9 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     )
     provenance = [("log", f"{one.path}: {one.bytes:,} bytes, sha256 {one.sha256}") for one in summary.inputs]
     made_from = Section("Provenance", [Facts([*provenance, ("place", place), ("made with", made)])], PAGE)
-    about = (
-        "From this drive icrtool learned how the robot slips when it turns, and then tested how far wheel speeds alone "
-        "keep its position."
-    )
+    about = "From it icrtool learned how the robot slips, and tested how far wheel speeds alone keep the position."
+    if not with_verdict(summary, stated).usable:
+        about = "How the robot slips when it turns could not be learned from this drive."
     rows = rows_of(one.name for one in report.models)
     meanings = {name: f"{row.words}; learned from {row.knows}" for name, row in rows.items()}
     words = Section("ICR, recommended, no_slip, trial, σ …", [Facts(list((meanings | GLOSSARY).items()))], PAGE)
@@ -137,6 +139,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
         SCRIPTS, drive_data(compared, report, coordinates=coordinates), title=summary.log,
         kind="Drive without GNSS: report of one log", blocks=blocks, pictures=pictures,
         duration_s=summary.drive.duration_s, groups=(), folded_models=len(rows) - len(shown_rows(list(rows))),
+        sketch=drive_sketch(run, stated),
     )  # fmt: skip
 
 
@@ -160,12 +163,32 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     warnings = [one.text for one in summary.notes if not is_grave(one)]
     return [
         unusable_line(summary), Facts([("next", advice(summary))]),
-        Section("Answer", answer_sections(summary, report), name="answer"),
+        Section("Answer", _cards(summary, report), name="answer"),
+        controller_section(report),
         Section("The drive", drive, name="drive"),
         errors_section(report, summary), worst_section(summary, report), model_section(report),
         Section("Acceptance limits", verdict_lines(report), name="limits"),
         Section("Warnings", [Items(warnings) if warnings else "None."], PAGE, name="warnings"),
     ]  # fmt: skip
+
+
+def _cards(summary: RunDocument, report: DropoutDocument) -> list[Section]:
+    """Return the answer as cards, the drive from above in the last one."""
+    cards = []
+    for one in answer_sections(summary, report):
+        blocks = [
+            block._replace(caption="") if isinstance(block, Table) and block.caption == one.title else block
+            for block in one.blocks
+        ]
+        # The checks below it are the reasons for care; only a change of ground is not among them.
+        care = one.name == "trust" and one.grade == "care"
+        cards.append(one._replace(blocks=blocks, text=summary.partly_because or "" if care else one.text))
+    up = "The drive from above, north up" if summary.gnss.datum is not None else "The drive from above"
+    marks = f"{up}; ○ start, ■ end{', red: the trial with the largest error' if report.worst else ''}."
+    drawing = Figure((), "sketch", (Chart("sketch", up, marks),))
+    if cards[-1].name != "worst-case":
+        return [*cards, Section("The drive", [drawing], name="worst-case")]
+    return [*cards[:-1], cards[-1]._replace(blocks=[drawing])]
 
 
 def _settings(summary: RunDocument) -> list[Section]:
@@ -276,9 +299,9 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
     blocks: list[Block] = [
         Title(title, about),
         Section("The robot, from all logs together", [_robots_table(document.calibrations)], name="robots"),
+        Section("All logs together", [Figure(tuple(pictures), folded=False)] if pictures else [], name="pictures"),
         Section("Logs", [_logs_table(logs, folder)], name="logs"),
         Section("Why logs failed", [why], name="failed"),
-        Section("All logs together", [Figure(tuple(pictures), folded=False)] if pictures else [], name="pictures"),
     ]
     kind = "Drive without GNSS: report of many logs"
     return render(("fleet.js",), None, title=title, kind=kind, blocks=blocks, pictures=pictures)
@@ -288,6 +311,7 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
     """Return the table of the calibration from all logs of each robot."""
     grouped = any(one.group for one in calibrations)
     rows: list[list[str | Cell]] = []
+    incomplete = any(one.left_out for one in calibrations)
     for one in calibrations:
         numbers = [Cell(one.reason), Cell("")]
         if one.multiplier is not None:
@@ -299,10 +323,11 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
             numbers = [Cell(f"{one.multiplier:.3f}", f"± {one.multiplier_std:.3f}"), Cell(within)]
         icrs = ", ".join(map(signed, one.icrs_m))
         more = [one.group] if grouped else []
-        rows.append([one.robot or "all logs", *numbers, *more, f"{len(one.logs)}", icrs, ", ".join(one.left_out)])
-    group = ("group",) if grouped else ()
-    head = ("robot", "multiplier", "within 0.5 m (95 %) for", *group, "logs", "ICRs right, left, x [m]", "left out")
-    return Table(f"lrr{'l' * grouped}rrl", rows, head, "Each log was predicted without itself")
+        left_out = [", ".join(one.left_out)] if incomplete else []
+        rows.append([one.robot or "all logs", *numbers, *more, f"{len(one.logs)}", icrs, *left_out])
+    group, omitted = ("group",) if grouped else (), ("left out",) if incomplete else ()
+    head = ("robot", "multiplier", "within 0.5 m (95 %) for", *group, "logs", "ICRs right, left, x [m]", *omitted)
+    return Table(f"lrr{'l' * grouped}rr{'l' * incomplete}", rows, head, "Each log was predicted without itself")
 
 
 def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
@@ -329,28 +354,47 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
         f"One line a log; its name opens its page. Errors: 95 % of the trials of {CHOICE_HORIZON_M:g} m stay below."
     )
     head = ("log", "status", *named, *next(iter(numbers_of), ()))
-    return Table(f"ll{'l' * len(named)}r", rows, head, caption, search=search)
+    return Table(f"ll{'l' * len(named)}r", rows, head, caption, search=search, folded=_folded_columns(logs))
 
 
 def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
     """Return the cells of a log, by the name of the column; `budgets`: error names of distances."""
-    columns = {}
+    columns = {
+        "start": Cell(log.start_utc.replace("T", " ").removesuffix("Z")[:16], order=log.start_utc),
+        "duration": _cell(log.duration_s, duration_text),
+        "distance": _cell(log.distance_m, distance_text),
+    }
     for name in budgets:
         bound, (row, _, budget) = "> " if name in log.bounds else "", name.removesuffix("m_m").rpartition("_within_")
         columns[f"{row} within {budget} m"] = _cell(log.errors.get(name), partial("{}{:.1f} m".format, bound))
     for model in IN_CSV:
-        columns[f"error, {model}"] = _cell(log.errors.get(f"{model}_p95_{CHOICE_HORIZON_M:g}m_m"), error_text)
+        columns[_error_column(model)] = _cell(log.errors.get(f"{model}_p95_{CHOICE_HORIZON_M:g}m_m"), error_text)
     columns["multiplier"] = _with_std(log.multiplier, log.multiplier_std, "")
     for name, word in ICR_WORDS.items():
         columns[f"ICR {word}"] = _with_std(log.icr.get(name), log.icr.get(f"std_{name}"), "+")
     return columns | {
-        "distance": _cell(log.distance_m, distance_text),
-        "duration": _cell(log.duration_s, duration_text),
-        "start": Cell(log.start_utc.replace("T", " ").removesuffix("Z"), order=log.start_utc),
         "events": _cell(log.events, str),
         "warnings": _cell(log.warnings, str)._replace(note=", ".join(log.codes)),
         "limits not met": _cell(log.gates_failed, str),
     }
+
+
+def _error_column(model: str) -> str:
+    return f"error, {model}"
+
+
+def _folded_columns(logs: Sequence[FleetLog]) -> list[str]:
+    """Return the columns of a fleet that are shown on demand: further rows, ICRs, events, and limits where none failed.
+
+    Notes
+    -----
+    What is left has a place on a screen of 1280 pixels.
+    """
+    names = {name.partition("_p95_")[0] for log in logs for name in log.errors}
+    kept = (CONTROLLER, MOST_USEFUL if MOST_USEFUL in names else WITHOUT_IT, "no_slip")
+    further = [_error_column(model) for model in IN_CSV if model not in kept]
+    limits = [] if any(log.gates_failed for log in logs) else ["limits not met"]
+    return [*further, *(f"ICR {word}" for word in ICR_WORDS.values()), "events", *limits]
 
 
 def _cell(value: float | None, text: Callable[[Any], str]) -> Cell:
@@ -366,8 +410,8 @@ def calibration_page(found: Calibration) -> str:
     """Return the page of a calibration as HTML."""
     title = found.name or found.robot.name or "calibration"
     return render(
-        (), None, title=title, kind="Drive without GNSS: calibration of a robot",
-        blocks=calibration_file_blocks(found, title),
+        (COPY,), None, title=title, kind="Drive without GNSS: calibration of a robot",
+        blocks=calibration_file_blocks(found, title), geometry=geometry_sketch(found),
     )  # fmt: skip
 
 
@@ -380,7 +424,7 @@ def comparison_page(found: GroupComparison, title: str) -> str:
 
     names, labels = list(found.groups), {name: model.label for name, model in MODELS.items()}
     groups = "; ".join(
-        f"{name}: {counted(len(one.logs), 'log')}, model {labels.get(one.model, one.model)}"
+        f"{name}: {counted(len(one.logs), 'log')}, {labels.get(one.model, one.model)}"
         for name, one in found.groups.items()
     )
     # The errors in the runs of each group over distance, by the group of the calibration.
@@ -400,10 +444,12 @@ def comparison_page(found: GroupComparison, title: str) -> str:
             for name in names
         ]
         by_group.append({"horizons_m": horizons, "models": models, "reference": {"p95": [], "expected": []}})
+    verdict = comparison_title(found)
+    sections = [one for one in transfer_blocks(found) if len(found.pairs) > 1 or not isinstance(one, str)]
     return render(
         (*VENDOR, "columns.js", "charts.js", "comparison.js"), {"by_group": by_group}, title=title,
-        kind="Drive without GNSS: groups of runs compared",
-        blocks=[Title(f"{', '.join(names)} ({title})", groups), *transfer_blocks(found)],
+        kind=f"Drive without GNSS: groups of runs compared ({title})",
+        blocks=[verdict._replace(facts=f"{verdict.facts} {groups}.".lstrip()), *sections],
         groups=names, folded_models=0, pictures=drawn_pictures([("transfer", transfer(found))]),
     )  # fmt: skip
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import product
+from typing import NamedTuple
 
 from msgspec import UNSET
 
@@ -21,9 +22,8 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS
-from icrtool.output.exports.controllers import format_export
 from icrtool.output.files.formats import csv_bytes
-from icrtool.output.tables.dropout import parameter_table, reach_row
+from icrtool.output.tables.dropout import configuration_blocks, parameter_table, reach_row
 from icrtool.output.tables.run import blocks_of_numbers
 from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import controller_error_text, error_text, model_text, plus_minus
@@ -32,7 +32,7 @@ from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.fleet_document import BUDGET_M
 from icrtool.records.plain_data import known
 from icrtool.records.rows import MOST_USEFUL, in_order, shown_rows
-from icrtool.records.run import ICR_COLUMNS
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.text import counted, distance_text, with_interval, with_std
 
 
@@ -73,12 +73,9 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
     driven = distance_text(sum(log.distance_m for log in found.logs))
     about = f"{found.robot.name or 'robot'}: {counted(len(found.logs), 'log')}, {driven}, {model_text(found.fitted)}"
     made = f"{about}. Made {found.created or 'at an unknown time'} with icrtool {found.tool_version or 'unknown'}."
-    numbers = blocks_of_numbers(found.controller, found.width_m, icrs)
-    if alone := controller_error_text(found.controller_errors):
-        numbers.append(alone)
+    configuration: list[Block] = []
     with suppress(DataError):
-        numbers += ["As a diff_drive_controller takes them:"]
-        numbers += [Line(format_export(found, "diff_drive_controller"), "as is")]
+        configuration = configuration_blocks(found, "CAL.json")
     unknown = "; ".join(TERMS[name].meaning for name in found.fitted.not_shown)
     parameters: list[Block] = [
         parameter_table(found.fitted, found.fitted_with_gyro),
@@ -94,29 +91,48 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
     return [
         Line(f"Not fit for use: {'; '.join(unfit)}" if unfit else "", "bad"),
         Title(title, made),
-        Section("Numbers for the controller", numbers, name="numbers"),
-        Section("Errors on distance that was not fitted", list(_held_out_tables(found)), name="held-out"),
+        Section("Answer", _calibration_cards(found, icrs), name="answer"),
+        Section("Configuration to copy", configuration, name="controller"),
+        Section("Errors of each log that was not fitted", [_left_out_table(found)], name="held-out"),
         Section("Parameters of the motion model", parameters, name="parameters"),
         Section("Logs", [Table("lr", logs, head)], name="logs"),
         Section("Warnings", [Items(found.warnings) if found.warnings else "None."], name="warnings"),
     ]
 
 
-def _held_out_tables(found: Calibration) -> Iterator[Block]:
-    """Yield p95 and expected error of each model by horizon, of all held-out trials and of each log or block."""
+def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) -> list[Section]:
+    """Return error, numbers and a drawing of the ICRs as cards."""
     horizons = sorted({one.horizon_m for one in found.held_out_pooled})
     pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
-    head = ("model", *(f"{horizon:g} m" for horizon in horizons))
     rows = [
         (name, *(_errors_text(pooled.get((name, horizon))) for horizon in horizons))
         for name in in_order({one.model for one in found.held_out_pooled})
     ]
-    yield Table("lr", rows, head, "95 % / expected error [m] of all trials together")
+    head = ("95 % / expected [m]", *(f"{horizon:g} m" for horizon in horizons))
+    lead, text = "not known", "no distance was left out"
+    if (own := pooled.get((MOST_USEFUL, CHOICE_HORIZON_M))) is not None:
+        lead = error_text(own.p95_m)
+        text = f"after {CHOICE_HORIZON_M:g} m (95 %) with {MOST_USEFUL}, on distance that was not fitted"
+    numbers = blocks_of_numbers(found.controller, found.width_m, icrs)
+    if alone := controller_error_text(found.controller_errors):
+        numbers.append(alone)
+    title = "The ICRs of the tracks from above, forward up"
+    drawing = Figure((), "geometry", (Chart("geometry", title, f"{title}; bars: ±σ; boxes: the tracks."),))
+    return [
+        Section("How large is the error?", [Table("lr", rows, head)], lead=lead, text=text, name="reach"),
+        Section("Which numbers into the controller?", numbers, name="factors"),
+        Section("Where are the ICRs?", [drawing], name="worst-case"),
+    ]
+
+
+def _left_out_table(found: Calibration) -> Table:
+    """Return p95 and expected error by horizon of each log or block, predicted without itself."""
+    horizons = sorted({one.horizon_m for one in found.held_out_pooled})
     each = {(one.log, one.horizon_m): one for one in found.held_out if one.model == MOST_USEFUL}
     names = dict.fromkeys(one.log for one in found.held_out)
     rows = [(name, *(_errors_text(each.get((name, horizon))) for horizon in horizons)) for name in names]
-    caption = f"The row {MOST_USEFUL}, each log or block of distance predicted without itself"
-    yield Table("lr", rows, ("left out", *head[1:]), caption)
+    caption = f"95 % / expected error [m] of {MOST_USEFUL}, each log or block of distance predicted without itself"
+    return Table("lr", rows, ("left out", *(f"{horizon:g} m" for horizon in horizons)), caption)
 
 
 def _date_text(stamp_ns: int) -> str:
@@ -298,15 +314,35 @@ def transfer_blocks(found: documents.GroupComparison) -> list[Block]:
     logs = [f"{name}: {one.name}, {distance_text(one.distance_m)}" for name in names for one in found.groups[name].logs]
     return [
         *(change_sentence(pair, found) for pair in found.pairs),
-        Section("Do they differ?", [Items([pair.verdict for pair in found.pairs])]),
-        Section("What a calibration costs elsewhere", cost),
-        *map(_pair_section, found.pairs),
-        Section("Logs", [Items(logs)], PAGE),
+        Section("Do they differ?", [Items([pair.verdict for pair in found.pairs])], name="verdict"),
+        Section("What a calibration costs elsewhere", cost, name="cost"),
+        *(_pair_section(pair, f"pair-{number}") for number, pair in enumerate(found.pairs, start=1)),
+        Section("Logs", [Items(logs)], PAGE, name="logs"),
     ]
 
 
+class Change(NamedTuple):
+    """Whether the errors of two groups differ, in words.
+
+    Attributes
+    ----------
+    found, power : the finding, and the smallest change that would have been seen
+    differs : None where it is not known
+    """
+
+    found: str
+    power: str
+    differs: bool | None
+
+
 def change_sentence(pair: documents.ComparedPair, found: documents.GroupComparison) -> str:
-    """Return in a sentence whether the errors of two groups differ, and the smallest change that would be seen.
+    """Return in a sentence whether the errors of two groups differ, and the smallest change that would be seen."""
+    change = change_of(pair, found)
+    return f"{change.found}; {change.power}." if change.power else f"{change.found}."
+
+
+def change_of(pair: documents.ComparedPair, found: documents.GroupComparison) -> Change:
+    """Return whether the errors of two groups differ, and the smallest change that would be seen.
 
     Notes
     -----
@@ -317,30 +353,54 @@ def change_sentence(pair: documents.ComparedPair, found: documents.GroupComparis
     of_drives = f"with these {counted(drives, 'drive')}"
     measured = (one for one in pair.errors if None not in (one.p95_m, one.p95_low_m, one.p95_high_m))
     row = min(measured, key=lambda one: abs(one.horizon_m - CHOICE_HORIZON_M), default=None)
+    names = f"{pair.second} against {pair.first}"
     if row is None or row.p95_m is None or row.p95_low_m is None or row.p95_high_m is None:
         why = "the drives are too short for an interval of the difference"
-        return f"{pair.second} against {pair.first}: not known: {why}."
+        return Change(f"{names}: not known: {why}", "", None)
     seen = SEEN_HALF_WIDTHS * (row.p95_high_m - row.p95_low_m) / 2.0
     place = f"(95 % at {row.horizon_m:g} m)"
-    smallest = f"a change below {error_text(seen)} {place} would not have been seen"
+    power = f"{of_drives} a change below {error_text(seen)} {place} would not have been seen"
     if row.p95_low_m <= 0.0 <= row.p95_high_m:
-        return f"{pair.second} against {pair.first}: no difference of the error found; {of_drives} {smallest}."
+        return Change(f"{names}: no difference of the error found", power, differs=False)
     word = "larger" if row.p95_m > 0.0 else "smaller"
     size = f"{with_interval(row.p95_m, row.p95_low_m, row.p95_high_m)} {place}"
-    return f"{pair.second} against {pair.first}: the error is {word}: {size}; {of_drives} {smallest}."
+    return Change(f"{names}: the error is {word}: {size}", power, differs=True)
+
+
+def comparison_title(found: documents.GroupComparison) -> Title:
+    """Return the verdict of a comparison as the heading of its page."""
+    changes = [change_of(pair, found) for pair in found.pairs]
+    if len(changes) == 1:
+        (change,) = changes
+        return Title(_capital(change.found), f"{_capital(change.power)}." if change.power else "")
+    differing = sum(change.differs is True for change in changes)
+    first = next(iter(found.groups))
+    return Title(f"{differing} of {counted(len(changes), 'group')} differ from {first} in their error", "")
+
+
+def _capital(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
 
 
 SEEN_HALF_WIDTHS = (1.96 + 0.84) / 1.96
 """A change of so many half widths of a 95 % interval is seen in 80 % of comparisons: quantiles of 97.5 and 80 %."""
 
 
-def _pair_section(pair: documents.ComparedPair) -> Section:
-    """Return how parameters and held-out errors of two groups differ."""
+QUANTITY_WORDS = {
+    **{name: f"ICR {word} [m]" for name, word in ICR_WORDS.items()},
+    "multiplier": "multiplier", "radius_left": "left wheel radius, of the configured",
+    "radius_right": "right wheel radius, of the configured",
+}  # fmt: skip
+"""Words for the quantities of a comparison."""
+
+
+def _pair_section(pair: documents.ComparedPair, place: str) -> Section:
+    """Return how parameters and held-out errors of two groups differ; `place`: name of its place on a page."""
     rows, errors = [], []
     for one in pair.parameters:
         values = (f"{value:+z.3f}" for value in (one.first, one.second))
-        significant = "yes" if one.significant else "no, may be chance"
-        rows.append((one.quantity, *values, with_std(one.difference, one.std, 3), significant))
+        word, shown = QUANTITY_WORDS.get(one.quantity, one.quantity), "yes" if one.significant else "no"
+        rows.append((word, *values, with_std(one.difference, one.std, 3), shown))
     for row in pair.errors:
         if row.p95_m is not None and row.expected_m is not None:
             p95 = with_interval(row.p95_m, row.p95_low_m, row.p95_high_m)
@@ -348,6 +408,7 @@ def _pair_section(pair: documents.ComparedPair) -> Section:
             errors.append((f"{row.horizon_m:g} m", p95, expected))
     route = ", the same route" if any(one.paired for one in pair.errors) else ""
     caption = f"Error of a fit to other trials, {pair.second} minus {pair.first}{route}, with its 95 % interval"
-    head = ("quantity", pair.first, pair.second, "difference ± std", "significant")
-    tables = [Table("lrrrl", rows, head), Table("lr", errors, ("after", "95 %", "expected"), caption)]
-    return Section(f"{pair.second} compared with {pair.first}", tables, VERBOSE)
+    head = ("quantity", pair.first, pair.second, "difference ± σ", "shown")
+    by_chance = "Parameters; a difference that is not shown may be chance (zero lies in its 95 % interval)"
+    tables = [Table("lrrrl", rows, head, by_chance), Table("lr", errors, ("after", "95 %", "expected"), caption)]
+    return Section(f"{pair.second} compared with {pair.first}", tables, VERBOSE, name=place)

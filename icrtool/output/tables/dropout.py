@@ -9,7 +9,7 @@ from contextlib import suppress
 from msgspec import UNSET
 from msgspec.structs import replace
 
-from icrtool.calibration.record import fitted_model, stored_calibration
+from icrtool.calibration.record import Calibration, fitted_model, stored_calibration
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
@@ -108,7 +108,7 @@ def with_verdict(summary: RunDocument, report: DropoutDocument) -> RunDocument:
 def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Section]:
     """Return distance, trust and worst case; for a run that is not usable, a section that states this."""
     if not (report.usable or report.budgets):
-        unknown = Section("How far without GNSS?", ["Not known: the run is not usable."], VERBOSE)
+        unknown = Section("How far without GNSS?", ["Not known: the run is not usable."], VERBOSE, name="reach")
         return [unknown, trust_section(summary, report)._replace(depth=VERBOSE)]
     cards = [reach_section(summary, report), numbers_section(summary, report), trust_section(summary, report)]
     for one in report.worst[:1]:
@@ -118,7 +118,7 @@ def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Secti
         by = f"with {one.model}{f'; meanwhile: {note}' if note else ''}"
         error = error_text(one.errors_m[one.model])
         text = f"after {driven}, {turned}, {by}"
-        cards.append(Section("Where was it worst?", [], lead=error, text=text, label="Worst"))
+        cards.append(Section("Where was it worst?", [], lead=error, text=text, label="Worst", name="worst-case"))
     return cards
 
 
@@ -178,7 +178,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
         blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
         blocks.append(Facts([("left out", f"recommended, controller: {report.ladder.left_out}")]))
-    return Section("How far without GNSS?", blocks, lead=lead, text=text)
+    return Section("How far without GNSS?", blocks, lead=lead, text=text, name="reach")
 
 
 def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
@@ -223,13 +223,13 @@ def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
         crossed = "trials across them count" if report.without_events is None else "left out"
         cares.append(f"{counted(len(events), 'slip event')}, {crossed}")
     grade: Grade = "care" if cares else "good"
-    sentence = f"yes, with care: {'; '.join(cares)}" if cares else "yes"
+    lead, why = ("yes, with care:" if cares else "yes"), "; ".join(cares)
     if not (summary.usable and report.passed):
-        grade, sentence = "bad", f"no: {summary.unusable_because or 'an acceptance limit is not met'}"
+        grade, lead, why = "bad", "no:", summary.unusable_because or "an acceptance limit is not met"
     if count := sum(not is_grave(one) for one in summary.notes):
         checks.append(Check("care", "log", f"{counted(count, 'warning')} about it"))
     found = Section("", [Checks(sorted(checks, key=lambda one: one.grade != "care"))], VERBOSE)
-    return Section("May I trust it?", [found], lead=sentence, label="Trust?", grade=grade)
+    return Section("May I trust it?", [found], lead=lead, text=why, label="Trust?", grade=grade, name="trust")
 
 
 def verdict_lines(report: DropoutDocument) -> list[Line]:
@@ -330,16 +330,40 @@ def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Tab
 
 
 def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:
-    """Return the numbers for a controller, the error with these numbers alone, and the controller's configuration."""
+    """Return the numbers for a controller, and the error with these numbers alone."""
+    title = "Which numbers into the controller?"
     if report.recommended is None or summary.config.robot.track_width_m is None:
-        return Section("Which numbers into the controller?", number_blocks(summary))
+        return Section(title, number_blocks(summary), name="factors")
     calibration = stored_calibration(report.recommended)
     controller, *icrs = number_blocks(summary, calibration.controller)
     blocks = [controller, Section("", icrs, VERBOSE)]
     if alone := controller_error_text(calibration.controller_errors):
         blocks.append(Section("", [alone], VERBOSE))
-    with suppress(DataError):
-        text = format_export(calibration, "diff_drive_controller")
-        other = "Other controllers: icrtool export --for clearpath RUN"
-        blocks.append(Section("As a diff_drive_controller takes them", [Line(text, "as is"), other], PAGE))
-    return Section("Which numbers into the controller?", blocks)
+    return Section(title, blocks, name="factors")
+
+
+def controller_section(report: DropoutDocument) -> Section:
+    """Return the configuration of a controller, to copy, and the commands that write it for others; only on a page."""
+    blocks: list[Block] = []
+    if report.recommended is not None:
+        with suppress(DataError):
+            blocks = configuration_blocks(stored_calibration(report.recommended), "RUN")
+    return Section("Configuration to copy", blocks, PAGE, name="controller")
+
+
+EXPORTS = {"Clearpath": "clearpath", "Husarion": "husarion", "robot_localization, Nav2": "nav2",
+           "another program": "json", "an ICR model": "icr"}  # fmt: skip
+"""Targets of `icrtool export` that a page names beside the configuration of a diff_drive_controller, by their users."""
+
+
+def configuration_blocks(calibration: Calibration, name: str) -> list[Block]:
+    """Return the configuration of a diff_drive_controller, to copy, and the commands that write it for others.
+
+    Raises
+    ------
+    DataError
+        The calibration has no numbers for a controller.
+    """
+    text = format_export(calibration, "diff_drive_controller")
+    others = [(user, f"icrtool export --for {target} {name}") for user, target in EXPORTS.items()]
+    return [Line(text, "as is"), Table("ll", others, ("for", "command"))]

@@ -46,6 +46,7 @@
   });
   words.addEventListener("input", filter);
   for (const choice of choices) choice.addEventListener("change", filter);
+  document.getElementById("all-columns")?.addEventListener("change", (event) => table.classList.toggle("few", !event.target.checked));
   document.getElementById("filter").addEventListener("submit", (event) => event.preventDefault());
   filter();
 })();

@@ -241,11 +241,12 @@ const icrtoolMap = (() => {
       zoomAll() { svg.call(zoom.transform, d3.zoomIdentity); },
       hideModel(name, away) { hide(`loop ${name}`, away); },
       hidesModel(name) { return hidden.has(`loop ${name}`); },
-      drawLoop(result) {
+      drawLoop(result, zoom) {
         loop = result;
         const norths = [], easts = [];
         for (const { name, path } of result.models) {
-          if (hidden.has(`loop ${name}`)) continue;
+          // One trial is shown by the drive alone: a bad model's path may be longer than the whole drive.
+          if (zoom || hidden.has(`loop ${name}`)) continue;
           norths.push(...d3.extent(path.north).map((v) => v + north[result.start]));
           easts.push(...d3.extent(path.east).map((v) => v + east[result.start]));
         }
@@ -253,7 +254,7 @@ const icrtoolMap = (() => {
           norths.push(north[i]);
           easts.push(east[i]);
         }
-        fit(norths, easts);
+        fit(norths, easts, zoom);
         soon();
       },
       /** Where a moment is on the map, in pixels of its element: for tests. */

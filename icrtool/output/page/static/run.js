@@ -54,11 +54,11 @@ const icrtoolPage = (() => {
     return element;
   }
 
-  function openLoop(row = moment) {
+  function openLoop(row = moment, zoom = false) {
     setMoment(row);
     driven = row;
     result = icrtoolOpenLoop.drive(data, row, LENGTHS_M);
-    map.drawLoop(result);
+    map.drawLoop(result, zoom);
     const box = document.getElementById("loop"), table = document.createElement("table");
     text("caption", `Open loop from ${clock(series.t[row])} (${series.t[row].toFixed(1)} s): distance to the filter after so many metres`, table);
     const head = text("tr", "", table.createTHead());
@@ -101,7 +101,7 @@ const icrtoolPage = (() => {
   onClick("zoom-all", () => { map.zoomAll(); charts.show(0, data.duration_s); });
   for (const button of document.querySelectorAll(".at-moment")) {
     button.addEventListener("click", () => {
-      openLoop(rowAt(Number(button.dataset.t)));
+      openLoop(rowAt(Number(button.dataset.t)), true);
       document.getElementById("map").scrollIntoView({ block: "center" });
     });
   }

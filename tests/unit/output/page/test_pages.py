@@ -23,6 +23,7 @@ from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.page.drive_data import drive_data, packed, packed_levels, packed_sums
 from icrtool.output.page.pages import draw_pictures, run_page, write_page
 from icrtool.output.page.render import pictures_of
+from icrtool.output.page.sketch import drive_sketch
 from icrtool.output.tables.dropout import reach_rows, report_blocks
 from icrtool.output.text_blocks import format_blocks
 from icrtool.pipeline import fit
@@ -91,7 +92,7 @@ def test_the_answer_is_that_of_the_report(page: str, run: Run, report: DropoutRe
     assert f"{reached.distance_m:.1f} m" in text or f"more than {reached.distance_m:g} m" in text
     assert report.calibration is not None
     assert f"{report.calibration.controller.multiplier:.3f}" in text
-    assert "No: an acceptance limit" in text
+    assert "No: an acceptance limit" in text.replace("May I trust it?No:", "No: ")
     assert f"{report.document.worst[0].errors_m['recommended']:.3f} m" in text
 
 
@@ -133,6 +134,31 @@ def test_a_worst_trial_in_which_the_reference_jumped_is_marked(run: Run, report:
 def test_a_run_that_is_not_usable_begins_with_that(hostile_run: Run, report: DropoutReport) -> None:
     page = run_page(hostile_run, report.document, {})
     assert page.index("Do not use") < page.index("How far without GNSS")
+
+
+def test_a_run_that_is_not_usable_does_not_say_that_it_learned(
+    run: Run, hostile_run: Run, report: DropoutReport
+) -> None:
+    def header(one: Run) -> str:
+        return run_page(one, report.document, {}).partition("<main")[0]
+
+    assert "learned how the robot slips" in header(run)
+    assert "could not be learned" in header(hostile_run)
+    assert "icrtool learned" not in header(hostile_run)
+
+
+def test_the_drawing_of_the_drive_marks_the_worst_trial(run: Run, report: DropoutReport) -> None:
+    sketch = drive_sketch(run, report.document)
+    worst = report.document.worst[0]
+    rows = [int(np.argmin(np.abs(run.table.t_s - worst.t_s)))]
+    rows.append(int(np.argmin(np.abs(run.table.distance_m - run.table.distance_m[rows[0]] - worst.horizon_m))))
+    points = [np.array([text.split() for text in one[1:].split("L")], float) for one in (sketch.path, sketch.worst)]
+    assert all(np.all(one >= 0.0) and np.all(one <= [sketch.width, sketch.height]) for one in points)
+    # The length of the scale bar stands for its metres, also in the distance between the ends of the trial.
+    metres = np.hypot(*(column[rows[1]] - column[rows[0]] for column in (run.table.north_m, run.table.east_m)))
+    apart = np.hypot(*(points[1][-1] - points[1][0]))
+    assert apart / sketch.bar * sketch.bar_m == pytest.approx(metres, abs=2.0 * sketch.bar_m / sketch.bar)
+    assert sketch.bar_m in {0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0}
 
 
 def test_a_run_with_too_few_turns_states_what_to_drive(run: Run, report: DropoutReport) -> None:

@@ -1,0 +1,127 @@
+"""A drive, and the ICRs of a robot, from above: small drawings in the page itself, without a script, in its colours."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.calibration.record import Calibration
+from icrtool.kernels.arrays import Floats
+from icrtool.records.dropout_document import DropoutDocument
+from icrtool.records.run import ICR_COLUMNS, Run
+
+WIDTH, HEIGHT, MARGIN = 360.0, 240.0, 16.0
+"""Size of a sketch and its free edge [units of the drawing, one pixel or less each]."""
+
+LONGEST_BAR = 0.3
+"""Largest length of the scale bar, as a share of the width."""
+
+NEAR = 0.7
+"""Distance of two points below which the second one is not drawn [units of the drawing]."""
+
+
+class Sketch(NamedTuple):
+    """A drive from above, north up.
+
+    Attributes
+    ----------
+    path, worst : of an SVG path: the whole drive; the trial with the largest error, empty where there is none
+    start, end : first and last place (x, y)
+    bar, bar_m : length of the scale bar [units of the drawing] and what it stands for [m]
+    width, height : of the drawing
+    """
+
+    path: str
+    worst: str
+    start: tuple[float, float]
+    end: tuple[float, float]
+    bar: float
+    bar_m: float
+    width: float = WIDTH
+    height: float = HEIGHT
+
+
+def drive_sketch(run: Run, report: DropoutDocument) -> Sketch:
+    """Return the drive of a run from above, with the trial of the largest error."""
+    north, east = run.table.north_m, run.table.east_m
+    low, high = np.array([east.min(), north.min()]), np.array([east.max(), north.max()])
+    free = np.array([WIDTH, HEIGHT]) - 2.0 * MARGIN
+    # A robot that stands has no extent: a metre is shown.
+    scale = float(np.min(free / np.maximum(high - low, 1.0)))
+    middle = (low + high) / 2.0
+    x = WIDTH / 2.0 + scale * (east - middle[0])
+    y = HEIGHT / 2.0 - scale * (north - middle[1])
+    worst = ""
+    if report.worst:
+        first, last = _rows_of_trial(run, report.worst[0].t_s, report.worst[0].horizon_m)
+        worst = _svg_path(x[first : last + 1], y[first : last + 1])
+    bar_m = _round_length(LONGEST_BAR * WIDTH / scale)
+    start, end = ((round(float(x[row]), 1), round(float(y[row]), 1)) for row in (0, -1))
+    return Sketch(_svg_path(x, y), worst, start, end, round(bar_m * scale, 1), bar_m)
+
+
+def _rows_of_trial(run: Run, begin_s: float, horizon_m: float) -> tuple[int, int]:
+    """Return the first and the last row of a trial."""
+    last = len(run.table) - 1
+    begin = min(int(np.searchsorted(run.table.t_s, begin_s)), last)
+    end = int(np.searchsorted(run.table.distance_m, run.table.distance_m[begin] + horizon_m))
+    return begin, min(end, last)
+
+
+def _svg_path(x: Floats, y: Floats) -> str:
+    """Return an SVG path through points (n,), without points that lie on the one before them."""
+    parts: list[str] = []
+    before = (math.inf, math.inf)
+    for point in zip(x.tolist(), y.tolist(), strict=True):
+        if math.dist(before, point) >= NEAR:
+            parts.append(f"{point[0]:.1f} {point[1]:.1f}")
+            before = point
+    return f"M{'L'.join(parts)}"
+
+
+def _round_length(most_m: float) -> float:
+    """Return the largest of 1, 2, 5, 10, 20 … [m] that is not above a length."""
+    unit = 10.0 ** math.floor(math.log10(most_m))
+    return unit * max(digit for digit in (1.0, 2.0, 5.0) if digit * unit <= most_m * (1.0 + 1e-9))
+
+
+class Geometry(NamedTuple):
+    """A robot and its ICRs from above, forward up; the origin of the body in the middle.
+
+    Attributes
+    ----------
+    icrs : x and y of each ICR, and half the length of its bars (σ) along x and y [units of the drawing]
+    tracks : x of each track
+    labels : text for each ICR
+    bar, bar_m : length of the scale bar [units of the drawing] and what it stands for [m]
+    width, height : of the drawing
+    """
+
+    icrs: tuple[tuple[float, float, float, float], ...]
+    tracks: tuple[float, float]
+    labels: tuple[str, str]
+    bar: float
+    bar_m: float
+    width: float = WIDTH
+    height: float = HEIGHT
+
+
+def geometry_sketch(found: Calibration) -> Geometry:
+    """Return the ICRs of a calibration and the tracks of its robot."""
+    y_right, y_left, x_icr = (found.geometry[name] for name in ICR_COLUMNS)
+    std_right, std_left, std_x = (found.geometry_std[name] for name in ICR_COLUMNS)
+    half = found.width_m / 2.0
+    reach = max(abs(y_right) + std_right, abs(y_left) + std_left, half, 1e-3)
+    up = max(abs(x_icr) + std_x, 1e-3)
+    scale = min((WIDTH / 2.0 - 2.0 * MARGIN) / reach, (HEIGHT / 2.0 - 2.0 * MARGIN) / up)
+    icrs = tuple(
+        (WIDTH / 2.0 + scale * y, HEIGHT / 2.0 - scale * x_icr, scale * std, scale * std_x)
+        for y, std in ((y_left, std_left), (y_right, std_right))
+    )
+    bar_m = _round_length(LONGEST_BAR * WIDTH / scale)
+    return Geometry(
+        icrs, (WIDTH / 2.0 - scale * half, WIDTH / 2.0 + scale * half), (f"{y_left:+.3f} m", f"{y_right:+.3f} m"),
+        bar_m * scale, bar_m,
+    )  # fmt: skip
