@@ -104,6 +104,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
             antenna_m=antenna_m,
             antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
             clock_std_s=found.delays.clock_std_s,
+            heading_sensor=log.heading_sensor,
         ),
         losses_ns=quality.losses_ns,
         attitude=None if derived is None else derived.attitude,

@@ -10,6 +10,7 @@ quantiles are scaled to hold in these windows. The errors of the controller's mo
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -385,23 +386,40 @@ def measure_controller_errors(table: HeldOut) -> ControllerErrors | None:
     -------
     None where too few windows were left out.
     """
-    far, near = (_controller_window_errors(table, length) for length in (CHOICE_HORIZON_M, TWIST_OVER_M))
+    (far, _), (near, stretches) = (_window_errors(table, CONTROLLER, at) for at in (CHOICE_HORIZON_M, TWIST_OVER_M))
     if min(len(far), len(near)) < FEWEST_TESTED or CHOICE_HORIZON_M not in table.horizons_m:
         return None
     h = table.horizons_m.index(CHOICE_HORIZON_M)
+    velocities = near[:, :3] / near[:, 3:4]
+    turn_rate = turn_rate_std = None
+    if table.has_gyro:
+        of_gyro, of_stretches = _window_errors(table, f"{RECOMMENDED}{GYRO_SUFFIX}", TWIST_OVER_M)
+        if len(of_gyro) >= FEWEST_TESTED:
+            squares = (of_gyro[:, 2] / of_gyro[:, 3]) ** 2
+            turn_rate = max(float(squares.mean()), SMALLEST_VARIANCE)
+            turn_rate_std = float(squares.std()) / math.sqrt(max(of_stretches, 1))
     return ControllerErrors(
         pose_variance=_variances(far[:, :3]),
-        twist_variance=_variances(near[:, :3] / near[:, 3:4]),
+        twist_variance=_variances(velocities),
         turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
         way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
         p95_m=known(float(table.score(CONTROLLER).together.p95[h])),
         full_p95_m=known(float(table.score(RECOMMENDED).together.p95[h])),
+        twist_variance_std=_variance_stds(velocities, stretches),
+        gyro_rate_variance=turn_rate,
+        gyro_rate_variance_std=turn_rate_std,
     )
 
 
 def _variances(errors: Floats) -> tuple[float, float, float]:
     """Return mean squares (3,), never zero."""
     along, across, heading = np.maximum((errors**2).mean(axis=0), SMALLEST_VARIANCE).tolist()
+    return along, across, heading
+
+
+def _variance_stds(errors: Floats, stretches: int) -> tuple[float, float, float]:
+    """Return the standard deviations of `_variances` (3,), of errors of overlapping windows on separate stretches."""
+    along, across, heading = ((errors**2).std(axis=0) / math.sqrt(max(stretches, 1))).tolist()
     return along, across, heading
 
 
@@ -412,10 +430,15 @@ def _shares(missed: Floats, first: Floats, second: Floats) -> tuple[float, float
     return a, b
 
 
-def _controller_window_errors(table: HeldOut, length_m: float) -> Floats:
-    """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
-    rows = [np.empty((0, 6))]
-    for i, windows, predicted in _left_out_windows(table, CONTROLLER, [length_m]):
+def _window_errors(table: HeldOut, name: str, length_m: float) -> tuple[Floats, int]:
+    """Return the errors of a row in windows that it was not fitted to, and the number of separate stretches in them.
+
+    Returns
+    -------
+    (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m]; the number
+    """
+    rows, stretches = [np.empty((0, 6))], set[tuple[int, float]]()
+    for i, windows, predicted in _left_out_windows(table, name, [length_m]):
         path = predicted_path(table.recordings[i], *predicted, windows.track)
         begin, end = (windows.track.place_t[at] for at in (windows.begin, windows.end))
         (theta, turned), (place, moved) = (np.split(one, 2) for one in path(np.append(begin, end)))
@@ -423,4 +446,6 @@ def _controller_window_errors(table: HeldOut, length_m: float) -> Floats:
         turn = windows.turned
         off = turned - theta - turn
         rows.append(np.column_stack([error.real, error.imag, off, end - begin, turn, windows.length_m]))
-    return np.concatenate(rows)
+        places = np.floor(windows.track.distance[windows.begin] / windows.length_m)
+        stretches.update((i, place) for place in places.tolist())
+    return np.concatenate(rows), len(stretches)

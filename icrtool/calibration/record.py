@@ -116,8 +116,8 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     @property
     def controller_errors(self) -> documents.ControllerErrors | None:
         """Errors of what a controller can express; None where the drive is too short to measure them."""
-        errors = msgspec.structs.asdict(self.controller)
-        return None if errors["pose_variance"] is UNSET else msgspec.convert(errors, documents.ControllerErrors)
+        errors = {name: one for name, one in msgspec.structs.asdict(self.controller).items() if one is not UNSET}
+        return msgspec.convert(errors, documents.ControllerErrors) if "pose_variance" in errors else None
 
     def log_names(self) -> str:
         """Return the names of the logs that it was fitted to, and their number."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast, get_args
 import click
 
 from icrtool.cli import when_used
-from icrtool.cli.inputs import RUNS_FOLDER, is_log, read_calibration
+from icrtool.cli.inputs import RUNS_FOLDER, is_log, read_calibration_and_run
 from icrtool.cli.options import FILE, PLACE, choice, flag, option
 from icrtool.cli.printing import Printer, write_or_print
 from icrtool.records.choices import ControllerTarget, TrajectoryFormat
@@ -16,16 +16,18 @@ from icrtool.records.text import escaped
 
 with when_used():
     from icrtool import errors
-    from icrtool.calibration import record
+    from icrtool.calibration import localization, record
     from icrtool.output import run_directory
     from icrtool.output.exports import controllers, foxglove, paths
+    from icrtool.output.exports import localization as localization_file
     from icrtool.output.files import atomic, formats
 
 if TYPE_CHECKING:
     from icrtool.records.run import Run
 
 CONTROLLERS, TRAJECTORIES = get_args(ControllerTarget), get_args(TrajectoryFormat)
-EXPORT_TARGETS = (*CONTROLLERS, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
+LOCALIZATION = "robot_localization"
+EXPORT_TARGETS = (*CONTROLLERS, LOCALIZATION, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
 
 TEXT_SUFFIXES = (".txt", ".csv")
 """Suffixes of a file for one trajectory, in addition to the formats. Other text after a dot belongs to the name."""
@@ -46,6 +48,9 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
     first, with the same result; without an argument, the newest run below icrtool-runs/. The covariances are measured
     on distance held out of the fit. Target icr: the whole motion model as JSON, in REP-103 (y left).
 
+    Target robot_localization: ekf.yaml with parameters of its filter and of navsat_transform_node, and covariances of
+    wheel odometry and IMU, with source and standard deviation of each; of a CAL.json only the covariances.
+
     \b
     Paths of a RUN (world ENU about the datum, body x forward and y left):
       evo, kitti    trajectories in TUM or KITTI format: FILE is the filter's; DIR also gets icr and no_slip
@@ -57,6 +62,7 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
     Example:
       icrtool export --for clearpath icrtool-runs/field
       icrtool export --for icr season.json -o twist.json
+      icrtool export --for robot_localization icrtool-runs/field -o ekf.yaml
       icrtool export --for evo icrtool-runs/field -o trajectories
       icrtool export --for foxglove icrtool-runs/field -o field.mcap
     """  # noqa: D301 - click reads the escape
@@ -70,12 +76,15 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
             return
     if output is not None:
         atomic.check_place(output)
-    if target in CONTROLLERS:
-        name, found = read_calibration(source, force=force, advice=f"; {ALL_THE_SAME}")
+    if target in CONTROLLERS or target == LOCALIZATION:
+        name, found, run = read_calibration_and_run(source, force=force, advice=f"; {ALL_THE_SAME}")
         if (reasons := record.unfit_reasons(found)) and not force:
             advice = f"calibrate with other logs; {ALL_THE_SAME}"
             raise errors.DataError(name, f"not fit for use: {reasons[0].text}", advice)
-        text = controllers.format_export(found, cast(ControllerTarget, target))
+        if target == LOCALIZATION:
+            text = localization_file.format_localization(found, localization.localization(found, run))
+        else:
+            text = controllers.format_export(found, cast(ControllerTarget, target))
     else:
         run = _run(source, output)
         if target == "foxglove" and output is not None:

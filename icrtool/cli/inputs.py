@@ -118,18 +118,25 @@ def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[RunPlace
 
 def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:
     """Return a calibration and its name: of a calibration file, or of a run, which is calibrated."""
+    return read_calibration_and_run(source, force=force, advice=advice)[:2]
+
+
+def read_calibration_and_run(
+    source: Path | None, *, force: bool = False, advice: str = ""
+) -> tuple[str, Calibration, Run | None]:
+    """Return a calibration, its name, and the run that was calibrated; None for a calibration file."""
     if source is not None and source.suffix == ".json" and not source.exists() and not isinstance(source, UrlPath):
         raise errors.RunError(source, "no such file", "icrtool calibrate -o makes a calibration file")
     if source is not None and is_log(source):
         advice = f"icrtool fit {escaped(str(source))} makes its run, icrtool calibrate -o a calibration file"
         raise errors.RunError(source, "is a log, not a run or a calibration", advice)
     if source is not None and source.is_file():
-        return source.name, formats.open_calibration(source)
+        return source.name, formats.open_calibration(source), None
     run = run_directory.open_run(source or run_directory.newest_run(RUNS_FOLDER))
     if not (run.usable or force):
         why = f"its ICRs are not usable: {run.document.unusable_because}"
         raise errors.DataError(run.name, why, f"drive again, with turns to both sides{advice}")
-    return run.name, pooled.calibrate(run, allow_unusable=force)
+    return run.name, pooled.calibrate(run, allow_unusable=force), run
 
 
 def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:

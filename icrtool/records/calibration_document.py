@@ -92,6 +92,9 @@ class ControllerErrors(Record, frozen=True):
     twist_variance : (3,) of velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
     turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
     p95_m, full_p95_m : after 10 m, of the controller's model and of the recommended model; None without a trial of 10 m
+    twist_variance_std : (3,) standard deviations of `twist_variance`; None in files of older versions
+    gyro_rate_variance : of the turn rate of the model with a gyro, averaged over 1 m [rad^2/s^2], with its standard
+        deviation; None without a gyro
     """
 
     pose_variance: tuple[float, float, float]
@@ -100,6 +103,9 @@ class ControllerErrors(Record, frozen=True):
     way_noise: tuple[float, float]
     p95_m: float | None
     full_p95_m: float | None
+    twist_variance_std: tuple[float, float, float] | None = None
+    gyro_rate_variance: float | None = None
+    gyro_rate_variance_std: float | None = None
 
 
 class ControllerDocument(ControllerNumbers, frozen=True, kw_only=True):
@@ -111,6 +117,9 @@ class ControllerDocument(ControllerNumbers, frozen=True, kw_only=True):
     way_noise: tuple[float, float] | UnsetType = UNSET
     p95_m: float | UnsetType | None = UNSET
     full_p95_m: float | UnsetType | None = UNSET
+    twist_variance_std: tuple[float, float, float] | UnsetType | None = UNSET
+    gyro_rate_variance: float | UnsetType | None = UNSET
+    gyro_rate_variance_std: float | UnsetType | None = UNSET
 
 
 class ErrorSources(Record, frozen=True):

@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints, in_spans, runs_of
 from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
-from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
+from icrtool.records.samples import GyroSamples, HeadingSamples, HeadingSensor, Samples, StreamChoice, WheelSamples
 
 RESPONSE_S = 0.1
 """Longest lag of the body's motion behind the wheel speeds [s]. Source: rigid-body simulations."""
@@ -84,6 +84,7 @@ class LogFacts(Record, frozen=True, kw_only=True):
     antenna_m : the antenna from the body origin, forward and right
     antenna_is_known : its place was configured, or in the log
     clock_std_s : standard deviation of the time between position and heading, after the correction of delays
+    heading_sensor : topic of the log that states a heading, also where it is fused with others; None without one
     """
 
     heading_from_position: bool
@@ -94,6 +95,7 @@ class LogFacts(Record, frozen=True, kw_only=True):
     antenna_m: tuple[float, float]
     antenna_is_known: bool = False
     clock_std_s: float = 0.0
+    heading_sensor: HeadingSensor | None = None
 
     @property
     def headings_are_precise(self) -> bool:

@@ -242,6 +242,15 @@ def rate_and_jitter(stamps: Ints) -> tuple[float | None, float | None]:
 
 
 @dataclass(frozen=True, slots=True)
+class HeadingSensor:
+    """The topic that states a heading; `convention`: the one that its yaw was read with."""
+
+    topic: str
+    message_type: str
+    convention: Literal["enu", "ned"]
+
+
+@dataclass(frozen=True, slots=True)
 class InputFile:
     """A file that was read.
 

@@ -18,6 +18,7 @@ from icrtool.records.samples import (
     GyroAxes,
     GyroSamples,
     HeadingSamples,
+    HeadingSensor,
     InputFile,
     OtherReceiver,
     PositionFixes,
@@ -75,6 +76,7 @@ class RobotLog:
     other_receivers : further GNSS receivers
     other_references : the same log with another position reference and its heading, where it holds one
     slipping_ns : (k, 2) begins and ends of the slip events found in it: its wheels show nothing there
+    heading_sensor : the topic that states the heading, None without one
     """
 
     name: str
@@ -92,6 +94,7 @@ class RobotLog:
     other_receivers: tuple[OtherReceiver, ...] = ()
     other_references: tuple[RobotLog, ...] = ()
     slipping_ns: tuple[tuple[int, int], ...] = ()
+    heading_sensor: HeadingSensor | None = None
 
     @classmethod
     def from_frames(

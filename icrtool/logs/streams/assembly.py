@@ -25,7 +25,6 @@ from icrtool.logs.streams.sources import (
     BY_LOG,
     NO_HEADER,
     Clock,
-    Convention,
     HeadingSource,
     PositionSource,
     Source,
@@ -46,6 +45,7 @@ from icrtool.records.samples import (
     Datum,
     GyroAxes,
     HeadingSamples,
+    HeadingSensor,
     InputFile,
     OtherReceiver,
     PositionFixes,
@@ -172,6 +172,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     log = RobotLog(
         name, wheels, gnss, heading, datum, tuple(streams), survey.inputs, dict(position.rejected),
         (*survey.problems, *about(name, notes)), antenna, gyro, gyros, tuple(receivers),
+        heading_sensor=None if source is None else _heading_sensor(source, config),
     )  # fmt: skip
     return longest_part(log)
 
@@ -308,14 +309,18 @@ def _fixes(
 
 def _headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[HeadingSamples, str]:
     """Return headings clockwise from north, and a text on how the convention is known."""
-    convention: Convention = source.convention
-    why = source.convention_why
-    if config.frames.heading != "auto":
-        convention, why = config.frames.heading, "configured"
+    convention = _heading_sensor(source, config).convention
+    why = source.convention_why if config.frames.heading == "auto" else "configured"
     stamps = source.stamps.on(clock)
     rows, _, _ = increasing(stamps, source.usable)
     samples = HeadingSamples(stamps[rows], source.heading_rad(convention)[rows], source.variance[rows])
     return samples, f"{convention.upper()} ({why})"
+
+
+def _heading_sensor(source: HeadingSource, config: Config) -> HeadingSensor:
+    """Return the topic of a heading, and the convention that it is read with."""
+    convention = source.convention if config.frames.heading == "auto" else config.frames.heading
+    return HeadingSensor(source.topic, source.message_type, convention)
 
 
 MOST_NOT_FINITE = 0.01

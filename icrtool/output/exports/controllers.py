@@ -86,11 +86,7 @@ def format_export(calibration: Calibration, target: ControllerTarget) -> str:
     if errors is None:
         advice = "covariances need a longer drive"
         raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
-    begin_ns = min(log.begin_ns for log in calibration.logs)
-    distance_m = sum(log.distance_m for log in calibration.logs)
-    date = "at an unknown date"
-    if begin_ns:
-        date = datetime.fromtimestamp(begin_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    begin_ns, date, distance_m = _driven(calibration)
     numbers, robot = calibration.controller, calibration.robot
     if target == "json":
         document = {
@@ -119,15 +115,33 @@ def format_export(calibration: Calibration, target: ControllerTarget) -> str:
             "twist_width_m": robot.twist_width_m or None,
         }
         return json_bytes(document).decode().rstrip("\n")
+    return "\n".join([*_header(calibration, errors), *_parameters(calibration, errors, target)])
+
+
+def _driven(calibration: Calibration) -> tuple[int, str, float]:
+    """Return stamp and date of the first drive, and the distance [m] of all."""
+    begin_ns = min(log.begin_ns for log in calibration.logs)
+    date = "at an unknown date"
+    if begin_ns:
+        date = datetime.fromtimestamp(begin_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return begin_ns, date, sum(log.distance_m for log in calibration.logs)
+
+
+def export_origin(calibration: Calibration) -> str:
+    """Return a line on the program, the logs, when and how far they were driven, and the robot."""
+    _, date, distance_m = _driven(calibration)
+    robot = f", {one_line(name)}" if (name := calibration.robot.name) else ""
+    # The calibration of a report has no date, so that the same run gives the same file.
+    fitted = f", fitted {calibration.created[:10]}" if calibration.created else ""
     driven = f"driven {date}, {distance_m:.0f} m"
-    return "\n".join([*_header(calibration, errors, driven), *_parameters(calibration, errors, target)])
+    return f"icrtool {__version__}: {one_line(calibration.log_names())}, {driven}{robot}{fitted}"
 
 
 def _parameters(calibration: Calibration, errors: ControllerErrors, target: ControllerTarget) -> list[str]:
     """Return the lines of YAML: for a diff_drive_controller of the target, or for nav2 and robot_localization."""
-    rest = _number(NOT_PLANAR)
+    rest = yaml_number(NOT_PLANAR)
     pose, twist = (
-        f"[{_number(x)}, {_number(y)}, {rest}, {rest}, {rest}, {_number(yaw)}]"
+        f"[{yaml_number(x)}, {yaml_number(y)}, {rest}, {rest}, {rest}, {yaml_number(yaw)}]"
         for x, y, yaw in (errors.pose_variance, errors.twist_variance)
     )
     if target == "nav2":
@@ -135,12 +149,12 @@ def _parameters(calibration: Calibration, errors: ControllerErrors, target: Cont
         alphas = enumerate((*errors.turn_noise, *errors.way_noise), start=1)
         return [
             *NAV2.format(twist=twist, used=used).splitlines(),
-            *(f"    alpha{i}: {_number(one)}" for i, one in alphas),
+            *(f"    alpha{i}: {yaml_number(one)}" for i, one in alphas),
         ]
     numbers, radius = calibration.controller, calibration.robot.wheel_radius_m
-    lines = [f"wheel_separation: {_number(calibration.width_m)}"]
+    lines = [f"wheel_separation: {yaml_number(calibration.width_m)}"]
     if radius is not None:
-        lines.append(f"wheel_radius: {_number(radius)}")
+        lines.append(f"wheel_radius: {yaml_number(radius)}")
     for key, value, std, next_std in (
         ("wheel_separation_multiplier", numbers.multiplier, numbers.multiplier_std, numbers.multiplier_next_std),
         ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std, numbers.left_radius_next_std),
@@ -164,15 +178,11 @@ def _parameters(calibration: Calibration, errors: ControllerErrors, target: Cont
     return [*place, *textwrap.indent("\n".join(lines), " " * indent).splitlines()]
 
 
-def _header(calibration: Calibration, errors: ControllerErrors, driven: str) -> list[str]:
+def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     """Return the comments above: where the numbers come from, and what they cannot express."""
     (right, left, x), (std_right, std_left, std_x) = (
         [one[name] for name in ICR_COLUMNS] for one in (calibration.geometry, calibration.geometry_std)
     )
-    robot = f", {_one_line(name)}" if (name := calibration.robot.name) else ""
-    # The calibration of a report has no date, so that the same run gives the same file.
-    fitted = f", fitted {calibration.created[:10]}" if calibration.created else ""
-    origin = f"icrtool {__version__}: {_one_line(calibration.log_names())}, {driven}{robot}{fitted}"
     icrs = (
         f"y_icr_right {right:+z.3f} ± {std_right:.3f} m, y_icr_left {left:+z.3f} ± {std_left:.3f} m, "
         f"x_icr {x:+z.3f} ± {std_x:.3f} m (body: x forward, y right)"
@@ -182,20 +192,20 @@ def _header(calibration: Calibration, errors: ControllerErrors, driven: str) -> 
         f"not expressible here: x_icr {x:+z.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
         f"and the ICRs' middle {(right + left) / 2:+z.3f} m right of the body's"
     )
-    sentences = [origin, icrs, held_out, lost]
+    sentences = [export_origin(calibration), icrs, held_out, lost]
     if (factor := factor_to_old(calibration)) is not None:
         old = calibration.controller.multiplier / factor
         sentences.append(
             f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
             f"{factor:.4f} times the old"
         )
-    sentences += [f"WARNING: {_one_line(one.sentence)}" for one in export_notes(calibration)]
+    sentences += [f"WARNING: {one_line(one.sentence)}" for one in export_notes(calibration)]
     return [
         line for sentence in sentences for line in textwrap.wrap(f"# {sentence}", TEXT_WIDTH, subsequent_indent="# ")
     ]
 
 
-def _number(value: float) -> str:
+def yaml_number(value: float) -> str:
     """Return a YAML float of four digits: always with a point, or ROS takes it for an integer."""
     if not math.isfinite(value):
         raise ValueError(f"{value} cannot be exported")
@@ -203,7 +213,7 @@ def _number(value: float) -> str:
     return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}{e}{exponent}"
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
     """Return a text on one line for a comment; the name of a log may hold any character."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 

@@ -1,0 +1,238 @@
+"""Numbers of a drive for `robot_localization`: covariances, process noise, heading offset, place of the antenna.
+
+Frames of REP-103: x forward, y left, yaw counter-clockwise from east. Every number has its source, and its standard
+deviation where one is known; what the drive does not show is named.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.calibration.held_out import TWIST_OVER_M
+from icrtool.calibration.pooled import known_antenna_m
+from icrtool.calibration.record import Calibration
+from icrtool.calibration.sensor_findings import ANTENNA_AHEAD, ANTENNA_ASIDE
+from icrtool.errors import DataError
+from icrtool.estimation.filter_setup import configured_noise
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.filter_records import REFERENCE_STEP_S
+from icrtool.records.run import Run
+
+FILTER_PERIOD_S = 1.0 / 30.0
+"""Time between two predictions of robot_localization [s], as its own parameter files set it."""
+
+BLOCK_S = 1.0
+"""Duration of the stretches of a drive that count as independent changes of its speed [s]."""
+
+IMU_TYPE, FIX_TYPE = "sensor_msgs/Imu", "sensor_msgs/NavSatFix"
+"""Message types that navsat_transform_node reads."""
+
+DECLINATION_STD_DEG = 0.4
+"""Standard deviation of the World Magnetic Model's declination [deg], as its authors state it for medium latitudes."""
+
+X, Y, YAW, V_X, V_YAW = 0, 1, 5, 6, 11
+"""Places in the state of robot_localization: x y z, roll pitch yaw, their velocities, ax ay az."""
+
+
+class Estimate(NamedTuple):
+    """A number, its standard deviation (None where it has none), and its source."""
+
+    value: float
+    std: float | None
+    source: str
+
+
+class AntennaPlace(NamedTuple):
+    """The antenna from the body origin, forward and left [m], and how it is known."""
+
+    forward_m: float
+    left_m: float
+    source: str
+
+
+class Localization(NamedTuple):
+    """What `robot_localization` is given.
+
+    Attributes
+    ----------
+    twist : variances of the wheels' v_x, v_y [m^2/s^2] and yaw rate [rad^2/s^2], of one message
+    gyro_rate : variance of the gyro's yaw rate [rad^2/s^2], None without a gyro
+    process : variances for each second, by their place in its state
+    declination_rad, yaw_offset_rad : what its navsat_transform_node adds to the yaw of the IMU; None where not shown
+    wheel_topic, imu_topic : topics of the log, empty where it has none of the types
+    left_out : parameter and reason of each number that the drive does not show
+    """
+
+    twist: tuple[Estimate, Estimate, Estimate]
+    gyro_rate: Estimate | None
+    process: dict[int, Estimate]
+    declination_rad: Estimate | None
+    yaw_offset_rad: Estimate | None
+    antenna: AntennaPlace | None
+    wheel_topic: str
+    imu_topic: str
+    left_out: tuple[str, ...]
+
+
+def localization(calibration: Calibration, run: Run | None = None) -> Localization:
+    """Return the numbers of a calibration, and of the run that it was fitted to where there is one.
+
+    Raises
+    ------
+    DataError
+        The drives were too short to measure errors of the wheels.
+    """
+    errors = calibration.controller_errors
+    if errors is None:
+        advice = "covariances need a longer drive"
+        raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
+    source = f"held-out errors of the controller's model over {TWIST_OVER_M:g} m"
+    stds = errors.twist_variance_std or (None, None, None)
+    v_x, v_y, yaw_rate = (Estimate(*one, source) for one in zip(errors.twist_variance, stds, strict=True))
+    gyro_rate = None
+    if errors.gyro_rate_variance is not None:
+        of_gyro = f"held-out errors of the model with the gyro over {TWIST_OVER_M:g} m, the reference's noise included"
+        gyro_rate = Estimate(errors.gyro_rate_variance, errors.gyro_rate_variance_std, of_gyro)
+    left_out = [] if gyro_rate is not None else ["imu0: no gyro that turns with the robot"]
+    if run is None:
+        left_out += [
+            "process_noise_covariance: a property of one drive; export its run",
+            "navsat_transform_node and the antenna: properties of one log; export its run",
+        ]
+        return Localization((v_x, v_y, yaw_rate), gyro_rate, {}, None, None, None, "", "", tuple(left_out))
+    process = _pose_noise(run) | _speed_noise(calibration, run)
+    left_out.append("process noise of z, roll, pitch, vy and accelerations: the defaults of robot_localization")
+    declination, offset, why_no_offset = _yaw(run)
+    antenna, why_no_antenna = _antenna(run)
+    wheels, imu = _topics(run)
+    left_out += [why for why in (why_no_offset, why_no_antenna) if why]
+    return Localization(
+        (v_x, v_y, yaw_rate), gyro_rate, process, declination, offset, antenna, wheels, imu, tuple(left_out)
+    )
+
+
+def _topics(run: Run) -> tuple[str, str]:
+    """Return the topic of the wheels' odometry and of the gyro, empty where the log has none."""
+    wheels = next((one.topic for one in run.document.streams if one.role == "wheels" and _is_odometry(one)), "")
+    return wheels, "" if run.sensors.gyro is None else run.sensors.gyro.topic.partition(" (")[0]
+
+
+def _is_odometry(stream: object) -> bool:
+    return getattr(stream, "message_type", "") == "nav_msgs/Odometry"
+
+
+def _pose_noise(run: Run) -> dict[int, Estimate]:
+    """Return the process noise of x, y [m^2/s] and yaw [rad^2/s] that the filter ran with.
+
+    Notes
+    -----
+    The filter adds REFERENCE_STEP_S dt sigma^2 in dt (Pentzer 2014, Eq. 30, at any rate), robot_localization dt Q.
+    """
+    used, settings, configured = run.document.filter, run.config.filter, configured_noise(run.config)
+    found = {}
+    for places, std, unit, first, key, free in (
+        ((X, Y), used.process_position_mps, "m/s", configured.position_mps, "process_position_mps",
+         settings.process_position_mps == "auto"),
+        ((YAW,), used.process_heading_degps, "deg/s", configured.heading_degps, "process_heading_degps",
+         settings.process_heading_degps is None),
+    ):  # fmt: skip
+        how = f"of preset {used.preset}, not contradicted by the innovations" if free else "configured"
+        if std > first:
+            how = f"raised from {first:g} by the filter's innovations"
+        source = f"({std:g} {unit})² × {REFERENCE_STEP_S:g} s, filter.{key}: {how}"
+        value = REFERENCE_STEP_S * (math.radians(std) if unit == "deg/s" else std) ** 2
+        found |= {place: Estimate(value, None, source) for place in places}
+    return found
+
+
+def _speed_noise(calibration: Calibration, run: Run) -> dict[int, Estimate]:
+    """Return the process noise of v_x [m^2/s^3] and of the yaw rate [rad^2/s^3]; empty where the drive is too short.
+
+    Notes
+    -----
+    robot_localization predicts constant velocities: a change over its period dt has the variance dt Q.
+    """
+    table = run.table
+    interval = np.diff(table.t_s)
+    if len(interval) < 2:
+        return {}
+    k = max(1, math.ceil(FILTER_PERIOD_S / float(np.median(interval)) - 1e-6))
+    lasted = table.t_s[k:] - table.t_s[:-k]
+    moving = np.abs(table.v_left_mps) + np.abs(table.v_right_mps) > 0.0
+    gaps = np.concatenate([[0], np.cumsum(run.in_gap)])
+    good = moving[k:] & moving[:-k] & (gaps[k:-1] == gaps[: -k - 1]) & (lasted > 0.0)
+    blocks, which = np.unique((table.t_s[:-k][good] // BLOCK_S).astype(np.int64), return_inverse=True)
+    if len(blocks) < 2:
+        return {}
+    v_x, _, yaw_rate = calibration.twist(table.v_left_mps, table.v_right_mps)
+    return {
+        place: _mean_of_blocks((speed[k:] - speed[:-k])[good] ** 2 / lasted[good], which, float(np.median(lasted)))
+        for place, speed in ((V_X, v_x), (V_YAW, yaw_rate))
+    }
+
+
+def _mean_of_blocks(squares: Floats, which: Floats, lasted_s: float) -> Estimate:
+    count = np.bincount(which)
+    means = np.bincount(which, weights=squares) / count
+    std = float(means.std() / math.sqrt(len(means)))
+    return Estimate(float(squares.mean()), std, f"changes of the wheels' speed within {lasted_s:.3g} s, while moving")
+
+
+def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
+    """Return declination and offset [rad] that make the IMU's yaw count from east, or the reason why there are none.
+
+    Notes
+    -----
+    navsat_transform_node adds both to the yaw. Its declination is counter-clockwise: the negative of the usual one,
+    which is positive where magnetic north lies east of north.
+    """
+    sensor, found = run.sensors.facts.heading_sensor, run.document.heading
+    fixes = next((one.message_type for one in run.document.streams if one.role == "gnss"), "")
+    reason = ""
+    if fixes != FIX_TYPE:
+        reason = f"it reads {FIX_TYPE}, and the positions are {fixes or 'of another type'}"
+    elif sensor is None or found.source not in ("orientation", "fused"):
+        reason = "no IMU of the log states a heading"
+    elif sensor.message_type != IMU_TYPE:
+        reason = f"it reads {IMU_TYPE}, and the heading is {sensor.message_type} ({sensor.topic})"
+    elif sensor.convention == "ned" or found.applied_mirror:
+        reason = f"the yaw of {sensor.topic} is clockwise (NED), and it reads ENU: convert its messages first"
+    elif found.offset_deg is None:
+        reason = "the drive is too short to compare the heading with the course over ground"
+    if reason or sensor is None:
+        return None, None, f"navsat_transform_node: {reason}"
+    applied, std = math.radians(found.applied_offset_deg), found.offset_std_deg
+    compared = f"heading minus course over ground {found.offset_deg:+z.2f} deg, {found.windows} windows"
+    if found.applied_offset_deg == 0.0:
+        compared += ": too small to correct"
+    declination = Estimate(0.0, None, "no declination shown: yaw_offset is the whole offset")
+    of_north = found.magnetic_declination_deg
+    if of_north is not None and "magnetic declination" in (found.offset_name or ""):
+        words = f"World Magnetic Model: magnetic north is {of_north:+z.1f} deg east of north; the sign is that of ENU"
+        declination = Estimate(-math.radians(of_north), math.radians(DECLINATION_STD_DEG), words)
+        compared += ", without the declination"
+    offset = math.remainder(applied - declination.value, 2.0 * math.pi)
+    return declination, Estimate(offset, None if std is None else math.radians(std), compared), ""
+
+
+def _antenna(run: Run) -> tuple[AntennaPlace | None, str]:
+    """Return the place of the antenna, or what the positions show instead."""
+    forward, right = known_antenna_m(run)
+    if forward is not None and right is not None:
+        given = run.config.frames
+        configured = given.antenna_forward_m != "auto" or given.antenna_right_m != "auto"
+        how = "frames.antenna_forward_m, antenna_right_m" if configured else "the log's own transforms (/tf_static)"
+        return AntennaPlace(forward, -right, how), ""
+    words = []
+    for key, label in (
+        (ANTENNA_AHEAD, "antenna forward - x ICR"),
+        (ANTENNA_ASIDE, "antenna right - middle of the ICRs"),
+    ):
+        one = run.document.alignment.get(key)
+        if one is not None and one.value is not None and one.std is not None:
+            words.append(f"{label} = {one.value:+z.3f} ± {one.std:.3f} m")
+    shown = f"; positions show {' and '.join(words)}" if words else ""
+    return None, f"place of the antenna: not in the log{shown}; measure it and set frames.antenna_forward_m, _right_m"

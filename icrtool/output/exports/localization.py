@@ -1,0 +1,159 @@
+"""Numbers of a drive as parameters of `robot_localization`: YAML with comments for both of its nodes."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+
+from icrtool.calibration.localization import V_X, V_YAW, Estimate, Localization
+from icrtool.calibration.record import Calibration, export_notes
+from icrtool.output.exports.controllers import NOT_PLANAR, export_origin, one_line, yaml_number
+from icrtool.output.text_blocks import TEXT_WIDTH
+
+STATE = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "vroll", "vpitch", "vyaw", "ax", "ay", "az")
+"""The state of robot_localization, in the order of its parameters."""
+
+V_Y = STATE.index("vy")
+
+DEFAULT_PROCESS = (0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.01, 0.01, 0.015)
+"""Diagonal of robot_localization's own process noise, for each second, in the order of `STATE`."""
+
+NO_IMU_TOPIC, NO_ODOMETRY_TOPIC = "imu/data", "odom"
+"""Topics of parameter files of robot_localization, where the log has none."""
+
+
+def format_localization(calibration: Calibration, numbers: Localization) -> str:
+    """Return the YAML of both nodes, no line end."""
+    lines = [*_header(calibration, numbers), *_filter(numbers)]
+    if numbers.yaw_offset_rad is not None and numbers.declination_rad is not None:
+        lines += [
+            "navsat_transform_node:",
+            "  ros__parameters:",
+            *_value("magnetic_declination_radians", numbers.declination_rad),
+            *_value("yaw_offset", numbers.yaw_offset_rad),
+        ]
+    return "\n".join([*lines, *_antenna(numbers), *_left_out(numbers)])
+
+
+def _header(calibration: Calibration, numbers: Localization) -> list[str]:
+    """Return origin, warnings, and the covariances that belong into messages."""
+    v_x, v_y, yaw_rate = numbers.twist
+    rest = yaml_number(NOT_PLANAR)
+    row = ", ".join([*map(yaml_number, (v_x.value, v_y.value)), *[rest] * 3, yaml_number(yaw_rate.value)])
+    lines = [
+        *_comment(export_origin(calibration)),
+        *(line for one in export_notes(calibration) for line in _comment(f"WARNING: {one_line(one.sentence)}")),
+        "#",
+        *_comment(
+            "robot_localization takes the covariances of its inputs from their messages: it has no parameters for them."
+        ),
+        *_comment("Wheel odometry (twist.covariance); diff_drive_controller has a parameter for it:"),
+        f"#   twist_covariance_diagonal: [{row}]",
+        *(
+            f"#   {name}: {_estimate(one, unit)}"
+            for name, one, unit in (
+                ("vx, [0]", v_x, "m²/s²"), ("vy, [7]", v_y, "m²/s²"), ("vyaw, [35]", yaw_rate, "rad²/s²"),
+            )
+        ),
+        *_comment(f"vx, vy, vyaw: {v_x.source}; vz, vroll, vpitch: not shown on a plane", 2),
+    ]  # fmt: skip
+    if (gyro := numbers.gyro_rate) is not None:
+        lines += [
+            "# IMU (angular_velocity_covariance), in its driver:",
+            f"#   vyaw, [8]: {_estimate(gyro, 'rad²/s²')}",
+            *_comment(gyro.source, 2),
+        ]
+    return [*lines, "#"]
+
+
+def _filter(numbers: Localization) -> list[str]:
+    """Return the parameters of ekf_node."""
+    odometry = numbers.wheel_topic
+    named = "of the log" if odometry else "your wheel odometry; the log holds none"
+    lines = [
+        "ekf_filter_node:",
+        "  ros__parameters:",
+        "    two_d_mode: true  # the motion is estimated in the plane",
+        "    world_frame: odom  # without GNSS; the filter of the map frame also takes odometry/gps",
+        f"    odom0: {_text(odometry or NO_ODOMETRY_TOPIC)}  # {named}",
+        "    # vx, vyaw of the wheels; vy, which they state as 0, with the variance of the sideways motion",
+        *_used("odom0_config", {V_X, V_Y, V_YAW}),
+        "    odom0_differential: false",
+        "    odom0_relative: false",
+    ]
+    if numbers.gyro_rate is not None:
+        imu = numbers.imu_topic
+        lines += [
+            f"    imu0: {_text(imu or NO_IMU_TOPIC)}  # {'of the log' if imu else 'your IMU'}: its yaw rate",
+            *_used("imu0_config", {V_YAW}),
+            "    imu0_differential: false",
+            "    imu0_relative: false",
+        ]
+    if numbers.process:
+        for place, one in sorted(numbers.process.items()):
+            lines += _inner(f"{STATE[place]}: {_estimate(one)}, {one.source}")
+        lines += ["    process_noise_covariance:", *_matrix(numbers)]
+    return lines
+
+
+def _matrix(numbers: Localization) -> list[str]:
+    """Return the lines of a matrix of 15 rows, with the defaults where the drive shows nothing."""
+    diagonal = [numbers.process[i].value if i in numbers.process else one for i, one in enumerate(DEFAULT_PROCESS)]
+    rows = (
+        ", ".join(yaml_number(value) if column == row else "0.0" for column in range(len(STATE)))
+        for row, value in enumerate(diagonal)
+    )
+    lines = [f"       {row}," for row in rows]
+    lines[0] = lines[0].replace("       ", "      [", 1)
+    lines[-1] = f"{lines[-1][:-1]}]"
+    return lines
+
+
+def _used(key: str, places: set[int]) -> list[str]:
+    """Return the lines that state which values of a message are used."""
+    words = ["true" if place in places else "false" for place in range(len(STATE))]
+    rows = [", ".join(words[at : at + 3]) for at in range(0, len(STATE), 3)]
+    return [f"    {key}:", f"      [{rows[0]},", *(f"       {row}," for row in rows[1:-1]), f"       {rows[-1]}]"]
+
+
+def _antenna(numbers: Localization) -> list[str]:
+    if (at := numbers.antenna) is None:
+        return []
+    place = f"--x {at.forward_m:.3f} --y {at.left_m:.3f} --z 0.0"
+    return [
+        *_comment(f"Antenna ({at.source}; its height is not shown; gps: the frame_id of your fixes):"),
+        f"# ros2 run tf2_ros static_transform_publisher {place} --frame-id base_link --child-frame-id gps",
+    ]
+
+
+def _left_out(numbers: Localization) -> list[str]:
+    lines = (line for one in numbers.left_out for line in _comment(f"- {one_line(one)}", 0, "  "))
+    return ["# Left out, because the drive does not show it:", *lines] if numbers.left_out else []
+
+
+def _value(key: str, one: Estimate) -> list[str]:
+    """Return a parameter [rad] below a comment with its standard deviation and source."""
+    doubt = "" if one.std is None else f" ± {one.std:.4f} rad ({math.degrees(one.std):.1f} deg)"
+    return [*_inner(one.source), f"    {key}: {one.value:z.4f}{f'  #{doubt}' if doubt else ''}"]
+
+
+def _estimate(one: Estimate, unit: str = "") -> str:
+    """Return a number with its standard deviation, as ``0.0012 ± 0.0003 m²/s²``; without one it says so."""
+    doubt = f"± {one.std:.2g}" if one.std is not None else "(no σ)"
+    return f"{one.value:.4g} {doubt} {unit}".rstrip()
+
+
+def _text(topic: str) -> str:
+    """Return a name of a topic as YAML; a log may hold any character."""
+    plain = all(c.isalnum() or c in "/_~-." for c in topic) and topic.isascii()
+    return topic if plain else '"' + "".join(c for c in one_line(topic) if c not in '"\\') + '"'
+
+
+def _inner(text: str) -> list[str]:
+    """Return a comment among the parameters of a node."""
+    return textwrap.wrap(f"    # {text}", TEXT_WIDTH, subsequent_indent="    #   ")
+
+
+def _comment(text: str, indent: int = 0, further: str = "") -> list[str]:
+    first = f"# {' ' * indent}"
+    return textwrap.wrap(f"{first}{text}", TEXT_WIDTH, subsequent_indent=f"{first}{further}")
