@@ -17,7 +17,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.sensor_findings import ANTENNA_AHEAD, ANTENNA_ASIDE
 from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import configured_noise
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import REFERENCE_STEP_S
 from icrtool.records.run import Run
 
@@ -132,7 +132,7 @@ def _pose_noise(run: Run) -> dict[int, Estimate]:
     The filter adds REFERENCE_STEP_S dt sigma^2 in dt (Pentzer 2014, Eq. 30, at any rate), robot_localization dt Q.
     """
     used, settings, configured = run.document.filter, run.config.filter, configured_noise(run.config)
-    found = {}
+    found: dict[int, Estimate] = {}
     for places, std, unit, first, key, free in (
         ((X, Y), used.process_position_mps, "m/s", configured.position_mps, "process_position_mps",
          settings.process_position_mps == "auto"),
@@ -174,7 +174,7 @@ def _speed_noise(calibration: Calibration, run: Run) -> dict[int, Estimate]:
     }
 
 
-def _mean_of_blocks(squares: Floats, which: Floats, lasted_s: float) -> Estimate:
+def _mean_of_blocks(squares: Floats, which: Ints, lasted_s: float) -> Estimate:
     count = np.bincount(which)
     means = np.bincount(which, weights=squares) / count
     std = float(means.std() / math.sqrt(len(means)))
