@@ -33,9 +33,6 @@ IMU_TYPE, FIX_TYPE = "sensor_msgs/Imu", "sensor_msgs/NavSatFix"
 DECLINATION_STD_DEG = 0.4
 """Standard deviation of the World Magnetic Model's declination [deg], as its authors state it for medium latitudes."""
 
-X, Y, YAW, V_X, V_YAW = 0, 1, 5, 6, 11
-"""Places in the state of robot_localization: x y z, roll pitch yaw, their velocities, ax ay az."""
-
 
 class Estimate(NamedTuple):
     """A number, its standard deviation (None where it has none), and its source."""
@@ -60,7 +57,7 @@ class Localization(NamedTuple):
     ----------
     twist : variances of the wheels' v_x, v_y [m^2/s^2] and yaw rate [rad^2/s^2], of one message
     gyro_rate : variance of the gyro's yaw rate [rad^2/s^2], None without a gyro
-    process : variances for each second, by their place in its state
+    process : variances for each second, by the name of its state
     declination_rad, yaw_offset_rad : what its navsat_transform_node adds to the yaw of the IMU; None where not shown
     wheel_topic, imu_topic : topics of the log, empty where it has none of the types
     left_out : parameter and reason of each number that the drive does not show
@@ -68,7 +65,7 @@ class Localization(NamedTuple):
 
     twist: tuple[Estimate, Estimate, Estimate]
     gyro_rate: Estimate | None
-    process: dict[int, Estimate]
+    process: dict[str, Estimate]
     declination_rad: Estimate | None
     yaw_offset_rad: Estimate | None
     antenna: AntennaPlace | None
@@ -124,7 +121,7 @@ def _is_odometry(stream: object) -> bool:
     return getattr(stream, "message_type", "") == "nav_msgs/Odometry"
 
 
-def _pose_noise(run: Run) -> dict[int, Estimate]:
+def _pose_noise(run: Run) -> dict[str, Estimate]:
     """Return the process noise of x, y [m^2/s] and yaw [rad^2/s] that the filter ran with.
 
     Notes
@@ -132,11 +129,11 @@ def _pose_noise(run: Run) -> dict[int, Estimate]:
     The filter adds REFERENCE_STEP_S dt sigma^2 in dt (Pentzer 2014, Eq. 30, at any rate), robot_localization dt Q.
     """
     used, settings, configured = run.document.filter, run.config.filter, configured_noise(run.config)
-    found: dict[int, Estimate] = {}
-    for places, std, unit, first, key, free in (
-        ((X, Y), used.process_position_mps, "m/s", configured.position_mps, "process_position_mps",
+    found: dict[str, Estimate] = {}
+    for names, std, unit, first, key, free in (
+        (("x", "y"), used.process_position_mps, "m/s", configured.position_mps, "process_position_mps",
          settings.process_position_mps == "auto"),
-        ((YAW,), used.process_heading_degps, "deg/s", configured.heading_degps, "process_heading_degps",
+        (("yaw",), used.process_heading_degps, "deg/s", configured.heading_degps, "process_heading_degps",
          settings.process_heading_degps is None),
     ):  # fmt: skip
         how = f"of preset {used.preset}, not contradicted by the innovations" if free else "configured"
@@ -144,11 +141,11 @@ def _pose_noise(run: Run) -> dict[int, Estimate]:
             how = f"raised from {first:g} by the filter's innovations"
         source = f"({std:g} {unit})² × {REFERENCE_STEP_S:g} s, filter.{key}: {how}"
         value = REFERENCE_STEP_S * (math.radians(std) if unit == "deg/s" else std) ** 2
-        found |= {place: Estimate(value, None, source) for place in places}
+        found |= {name: Estimate(value, None, source) for name in names}
     return found
 
 
-def _speed_noise(calibration: Calibration, run: Run) -> dict[int, Estimate]:
+def _speed_noise(calibration: Calibration, run: Run) -> dict[str, Estimate]:
     """Return the process noise of v_x [m^2/s^3] and of the yaw rate [rad^2/s^3]; empty where the drive is too short.
 
     Notes
@@ -169,8 +166,8 @@ def _speed_noise(calibration: Calibration, run: Run) -> dict[int, Estimate]:
         return {}
     v_x, _, yaw_rate = calibration.twist(table.v_left_mps, table.v_right_mps)
     return {
-        place: _mean_of_blocks((speed[k:] - speed[:-k])[good] ** 2 / lasted[good], which, float(np.median(lasted)))
-        for place, speed in ((V_X, v_x), (V_YAW, yaw_rate))
+        name: _mean_of_blocks((speed[k:] - speed[:-k])[good] ** 2 / lasted[good], which, float(np.median(lasted)))
+        for name, speed in (("vx", v_x), ("vyaw", yaw_rate))
     }
 
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 import textwrap
 
-from icrtool.calibration.localization import V_X, V_YAW, Estimate, Localization
+from icrtool.calibration.localization import Estimate, Localization
 from icrtool.calibration.record import Calibration, export_notes
 from icrtool.output.exports.controllers import NOT_PLANAR, export_origin, one_line, yaml_number
 from icrtool.output.text_blocks import TEXT_WIDTH
 
 STATE = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "vroll", "vpitch", "vyaw", "ax", "ay", "az")
 """The state of robot_localization, in the order of its parameters."""
-
-V_Y = STATE.index("vy")
 
 DEFAULT_PROCESS = (0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.01, 0.01, 0.015)
 """Diagonal of robot_localization's own process noise, for each second, in the order of `STATE`."""
@@ -69,7 +67,7 @@ def _header(calibration: Calibration, numbers: Localization) -> list[str]:
 def _filter(numbers: Localization) -> list[str]:
     """Return the parameters of ekf_node."""
     odometry = numbers.wheel_topic
-    named = "of the log" if odometry else "your wheel odometry; the log holds none"
+    named = "of the log" if odometry else "your wheel odometry"
     lines = [
         "ekf_filter_node:",
         "  ros__parameters:",
@@ -77,7 +75,7 @@ def _filter(numbers: Localization) -> list[str]:
         "    world_frame: odom  # without GNSS; the filter of the map frame also takes odometry/gps",
         f"    odom0: {_text(odometry or NO_ODOMETRY_TOPIC)}  # {named}",
         "    # vx, vyaw of the wheels; vy, which they state as 0, with the variance of the sideways motion",
-        *_used("odom0_config", {V_X, V_Y, V_YAW}),
+        *_used("odom0_config", {"vx", "vy", "vyaw"}),
         "    odom0_differential: false",
         "    odom0_relative: false",
     ]
@@ -85,20 +83,21 @@ def _filter(numbers: Localization) -> list[str]:
         imu = numbers.imu_topic
         lines += [
             f"    imu0: {_text(imu or NO_IMU_TOPIC)}  # {'of the log' if imu else 'your IMU'}: its yaw rate",
-            *_used("imu0_config", {V_YAW}),
+            *_used("imu0_config", {"vyaw"}),
             "    imu0_differential: false",
             "    imu0_relative: false",
         ]
     if numbers.process:
-        for place, one in sorted(numbers.process.items()):
-            lines += _inner(f"{STATE[place]}: {_estimate(one)}, {one.source}")
+        for name, one in numbers.process.items():
+            lines += _inner(f"{name}: {_estimate(one)}, {one.source}")
         lines += ["    process_noise_covariance:", *_matrix(numbers)]
     return lines
 
 
 def _matrix(numbers: Localization) -> list[str]:
     """Return the lines of a matrix of 15 rows, with the defaults where the drive shows nothing."""
-    diagonal = [numbers.process[i].value if i in numbers.process else one for i, one in enumerate(DEFAULT_PROCESS)]
+    known = {name: one.value for name, one in numbers.process.items()}
+    diagonal = [known.get(name, one) for name, one in zip(STATE, DEFAULT_PROCESS, strict=True)]
     rows = (
         ", ".join(yaml_number(value) if column == row else "0.0" for column in range(len(STATE)))
         for row, value in enumerate(diagonal)
@@ -109,9 +108,9 @@ def _matrix(numbers: Localization) -> list[str]:
     return lines
 
 
-def _used(key: str, places: set[int]) -> list[str]:
+def _used(key: str, names: set[str]) -> list[str]:
     """Return the lines that state which values of a message are used."""
-    words = ["true" if place in places else "false" for place in range(len(STATE))]
+    words = ["true" if name in names else "false" for name in STATE]
     rows = [", ".join(words[at : at + 3]) for at in range(0, len(STATE), 3)]
     return [f"    {key}:", f"      [{rows[0]},", *(f"       {row}," for row in rows[1:-1]), f"       {rows[-1]}]"]
 
@@ -133,14 +132,14 @@ def _left_out(numbers: Localization) -> list[str]:
 
 def _value(key: str, one: Estimate) -> list[str]:
     """Return a parameter [rad] below a comment with its standard deviation and source."""
-    doubt = "" if one.std is None else f" ± {one.std:.4f} rad ({math.degrees(one.std):.1f} deg)"
-    return [*_inner(one.source), f"    {key}: {one.value:z.4f}{f'  #{doubt}' if doubt else ''}"]
+    deviation = "" if one.std is None else f" ± {one.std:.4f} rad ({math.degrees(one.std):.1f} deg)"
+    return [*_inner(one.source), f"    {key}: {one.value:z.4f}{f'  #{deviation}' if deviation else ''}"]
 
 
 def _estimate(one: Estimate, unit: str = "") -> str:
-    """Return a number with its standard deviation, as ``0.0012 ± 0.0003 m²/s²``; without one it says so."""
-    doubt = f"± {one.std:.2g}" if one.std is not None else "(no σ)"
-    return f"{one.value:.4g} {doubt} {unit}".rstrip()
+    """Return a number with its standard deviation, as ``0.0012 ± 0.0003 m²/s²``; ``(no σ)`` without one."""
+    deviation = f"± {one.std:.2g}" if one.std is not None else "(no σ)"
+    return f"{one.value:.4g} {deviation} {unit}".rstrip()
 
 
 def _text(topic: str) -> str:
