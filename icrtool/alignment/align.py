@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.clock_search import take_shifts, with_shifts
+from icrtool.alignment.clock_search import NO_SHIFTS, take_shifts, with_configured_delays, with_shifts
 from icrtool.alignment.conventions import apply_convention, decide_conventions
 from icrtool.alignment.corrections import AlignedStreams, align_streams
 from icrtool.alignment.estimator import estimate_alignment
@@ -53,7 +53,10 @@ def align(log: RobotLog, config: Config) -> Measurements:
     DataError
         Streams that cannot be used together, or a heading without any relation to the course over ground.
     """
+    given = NO_SHIFTS
     if config.filter.rules.corrects:
+        # before anything looks at the streams
+        log, config, given = with_configured_delays(log, config)
         log = without_interpolated(log)
     log = with_wheel_speeds(log, config)
     if not config.filter.rules.corrects:
@@ -72,7 +75,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     filled, bridge = bridged(found.sensors.wheels, config.filter.wheel_gap_s, found.sensors.fixes)
     notes = about(log.name, [*shifts.notes, *([] if bridge is None else [bridge])])
     sensors = replace(found.sensors, wheels=filled, events=seen.events, jumps=seen.jumps)
-    found = replace(found, findings=with_shifts(found.findings, shifts))
+    found = replace(found, findings=with_shifts(with_shifts(found.findings, given), shifts))
     return replace(found, sensors=sensors, notes=(*found.notes, *notes))
 
 
@@ -268,6 +271,7 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
 def agreement(log: RobotLog, config: Config) -> Agreement:
     """Return how the position reference of a log agrees with its wheels along its heading."""
     width = width_or_usual_m(config.robot.track_width_m)
+    log, config, _ = with_configured_delays(log, config)
     try:
         log = with_wheel_speeds(log, config)
         check_streams(log)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -59,6 +59,36 @@ class Shifts(NamedTuple):
 NO_SHIFTS = Shifts(0.0, 0.0, ())
 
 
+def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts]:
+    """Return a log whose streams are moved by their configured delays.
+
+    Returns
+    -------
+    log; the configuration in which no configured delay is left; what was moved
+    """
+    frames = config.frames
+    given: dict[str, float] = {
+        key: float(one)
+        for key, one in (("reference_delay_s", frames.reference_delay_s), ("heading_delay_s", frames.heading_delay_s))
+        if one != "auto"
+    }
+    gnss, heading = (given.get(key, 0.0) for key in ("reference_delay_s", "heading_delay_s"))
+    heading = gnss if log.heading_is_of_position else heading
+    if gnss == heading == 0.0:
+        return log, config, NO_SHIFTS
+    inner = replace(config, frames=replace(frames, **cast("dict[str, Any]", dict.fromkeys(given, 0.0))))
+    return _moved(log, gnss, heading), inner, Shifts(gnss, heading, ())
+
+
+def _moved(log: RobotLog, gnss_s: float, heading_s: float) -> RobotLog:
+    """Return a log whose fixes and headings are stamped earlier by some seconds."""
+    moved: dict[str, Any] = {
+        name: replace(stream, stamp_ns=stream.stamp_ns - round(by * 1e9))
+        for name, stream, by in (("gnss", log.gnss, gnss_s), ("heading", log.heading, heading_s))
+    }
+    return replace(log, **moved)
+
+
 def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts]:
     """Return a log whose streams are moved by their configured delays, or by delays that their speeds show.
 
@@ -67,16 +97,13 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
     log; the configuration with which it is to be aligned, in which no configured delay is left; what was moved
     """
     frames, notes = config.frames, list[Note]()
+    free = frames.reference_delay_s == "auto", frames.heading_delay_s == "auto"
+    log, config, given = with_configured_delays(log, config)
     shifts: dict[str, float] = {}
     own = _Rates.of_wheels(log) if _can_be_compared(log) else None
-    for word, key, given in (
-        ("gnss", "reference_delay_s", frames.reference_delay_s), ("heading", "heading_delay_s", frames.heading_delay_s),
-    ):  # fmt: skip
-        if given != "auto":
-            shifts[word] = float(given)
-            continue
-        if own is None:
-            shifts[word] = 0.0
+    for word, key, sought in (("gnss", "reference_delay_s", free[0]), ("heading", "heading_delay_s", free[1])):
+        shifts[word] = 0.0
+        if own is None or not sought:
             continue
         rates = _Rates.of_fixes(log) if word == "gnss" else _Rates.of_headings(log)
         shifts[word] = find_shift(own, rates)
@@ -85,16 +112,9 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
     if log.heading_is_of_position:
         shifts["heading"] = shifts["gnss"]
     if not any(shifts.values()):
-        return log, config, NO_SHIFTS
-    moved = {name: replace(getattr(log, name), stamp_ns=getattr(log, name).stamp_ns - round(by * 1e9))
-             for name, by in shifts.items()}  # fmt: skip
-    given_keys: dict[str, Any] = {
-        key: 0.0
-        for key, given in (("reference_delay_s", frames.reference_delay_s), ("heading_delay_s", frames.heading_delay_s))
-        if given != "auto"
-    }
-    inner = replace(config, frames=replace(frames, **given_keys))
-    return replace(log, **moved), inner, Shifts(shifts["gnss"], shifts["heading"], tuple(notes))
+        return log, config, given
+    total = Shifts(given.gnss + shifts["gnss"], given.heading + shifts["heading"], tuple(notes))
+    return _moved(log, shifts["gnss"], shifts["heading"]), config, total
 
 
 def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Finding]:

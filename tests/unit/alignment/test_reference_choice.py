@@ -76,3 +76,29 @@ def test_preset_paper_keeps_what_was_chosen(good: RobotLog) -> None:
 def test_the_residual_is_that_of_the_positions(good: RobotLog) -> None:
     assert agreement(good, CONFIG).residual_m < 0.1
     assert agreement(with_noise(good, 1.0), CONFIG).residual_m == pytest.approx(np.sqrt(2) * 2.146, rel=0.25)
+
+
+@pytest.mark.parametrize("delay_s", [5.0, 18.0])
+def test_configured_delays_move_the_references_before_they_are_compared(good: RobotLog, delay_s: float) -> None:
+    late = replace(good, gnss=replace(good.gnss, stamp_ns=good.gnss.stamp_ns + round(delay_s * 1e9)))
+    drifts = with_noise(good, 0.7, correlated_s=12.0)
+    log = named(late, "/gps/fix", (named(drifts, "/lidar/pose"),))
+    config = load_config(sets=["robot.track_width_m=0.8", f"frames.reference_delay_s={delay_s}"])
+    assert agreement(late, config).residual_m == pytest.approx(agreement(good, CONFIG).residual_m, rel=1e-6)
+    assert agreement(late, CONFIG).residual_m > 1.0
+    assert choose_reference(log, config) is log
+
+
+def test_configured_delays_move_the_fixes_before_the_unit_of_the_wheels_is_found(good: RobotLog) -> None:
+    delay_s = 12.0
+    in_radians = replace(good.wheels, left=good.wheels.left / 0.2, right=good.wheels.right / 0.2, unit="rad")
+    late = replace(good, gnss=replace(good.gnss, stamp_ns=good.gnss.stamp_ns + round(delay_s * 1e9)))
+    config = load_config(sets=["robot.track_width_m=0.8", f"frames.reference_delay_s={delay_s}"])
+    found, of_good = (
+        fit(replace(one, wheels=in_radians), with_delay).document
+        for one, with_delay in ((late, config), (good, load_config(sets=["robot.track_width_m=0.8"])))
+    )
+    by_late, by_good = (
+        [note.text for note in one.notes if note.code == "wheel_unit_estimated"] for one in (found, of_good)
+    )
+    assert by_late == by_good != []
