@@ -21,7 +21,7 @@ from icrtool.alignment.turn_rates import BETTER_SCATTER_RATIO, TurnRate, course_
 from icrtool.alignment.wheel_alignment import compare_turns
 from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats, rows_of_cells, trapezoids, unwrapped, wrapped
+from icrtool.kernels.arrays import Bools, Floats, rows_of_cells, trapezoids, unwrapped, wrapped
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
 from icrtool.records.notes import note
@@ -260,9 +260,9 @@ def _derived(
         attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - estimate.offset[0], thin(stated.var_rad2))
     stamps, turn_stamps = (epoch + np.round(t * 1e9).astype(np.int64) for t in (estimate.t, turn.t))
     causal, smoothed = wrapped(estimate.causal), wrapped(estimate.smoothed)
-    # the causal heading begins where it is known
+    # the causal heading begins where it is known, and again after a hole of the turn rate
     std = estimate.causal_std
-    known = slice(int(np.argmax(std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(std))))), None)
+    known = known_again(estimate.t, std, turn.holes)
     return DerivedHeading(
         source,
         " + ".join(names),
@@ -273,6 +273,26 @@ def _derived(
         attitude,
         f"{', '.join(parts)}; σ {math.degrees(estimate.median_causal_std):.2f}°",
     )
+
+
+def known_again(t: Floats, std: Floats, holes: Floats) -> Bools:
+    """Return which causal headings (n,) are known: not the first ones, nor those after a hole, while sigma is large.
+
+    Their errors are one error, that of the start or of the turn in the hole; the filter would take them for many.
+
+    Parameters
+    ----------
+    t : (n,) [s]; std : (n,) [rad]; holes : (m, 2) [s]
+    """
+    clear = std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(std)))
+    known, found = np.ones(len(t), np.bool_), np.flatnonzero(clear)
+    for begin, until in ((-math.inf, -math.inf), *holes.tolist()):
+        first = int(np.searchsorted(t, begin, side="right"))
+        after = int(np.searchsorted(found, max(first, int(np.searchsorted(t, until)))))
+        if after < len(found) or math.isfinite(begin):
+            unclear = slice(first, found[after] if after < len(found) else None)
+            known[unclear] &= clear[unclear]
+    return known
 
 
 def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog | None:

@@ -47,6 +47,10 @@ LONGEST_STRETCH_S = 60.0
 """Longest duration of two displacements, and longest time between them, to compare them without a turn rate [s]."""
 
 
+LEAST_HOLE_STD_RADPS = math.radians(10.0)
+"""Smallest standard deviation of a turn rate that nothing measured [rad/s]."""
+
+
 @dataclass(frozen=True)
 class TurnRate:
     """A turn rate, clockwise.
@@ -56,7 +60,8 @@ class TurnRate:
     t : (n,) [s]; rate : (n,) [rad/s]
     holes : (m, 2) begins and ends of stretches [s] in which it was not measured
     scale_std, bias_std : deviations of its scale and bias before the log
-    hole_std : deviation of the rate within a hole [rad/s]; delay_std_s : of its stamps, None: half an interval
+    hole_std : deviation of the rate within each hole (m,), or within all of them [rad/s]
+    delay_std_s : deviation of its stamps, None: half an interval
     """
 
     t: Floats
@@ -64,7 +69,7 @@ class TurnRate:
     holes: Floats = field(default_factory=lambda: np.empty((0, 2)))
     scale_std: float = 0.02
     bias_std: float = math.radians(2.0)
-    hole_std: float = math.radians(10.0)
+    hole_std: float | Floats = LEAST_HOLE_STD_RADPS
     delay_std_s: float | None = None
 
     @cached_property
@@ -75,8 +80,8 @@ class TurnRate:
     def hole_variance(self, t: Floats) -> Floats:
         """Return the variance that its holes have added until times t (n,) [rad^2]."""
         total = np.zeros(len(t))
-        for begin, end in self.holes:
-            total += (self.hole_std * np.clip(t - begin, 0.0, end - begin)) ** 2
+        for (begin, end), std in zip(self.holes, np.broadcast_to(self.hole_std, len(self.holes)), strict=True):
+            total += (std * np.clip(t - begin, 0.0, end - begin)) ** 2
         return total
 
 
@@ -262,7 +267,15 @@ def wheel_rate(track: Track, width_m: float) -> TurnRate:
     rate = WHEEL_TURN * (track.v_left - track.v_right) / width_m
     gaps = np.flatnonzero(track.held[:-1] == 0.0)
     holes = np.column_stack([track.t[gaps], track.t[gaps + 1]])
-    return TurnRate(track.t, rate, holes, scale_std=WHEEL_SCALE_STD, bias_std=math.radians(0.5), delay_std_s=RESPONSE_S)
+    return TurnRate(
+        track.t, rate, holes, scale_std=WHEEL_SCALE_STD, bias_std=math.radians(0.5), hole_std=_any_rate_std(rate),
+        delay_std_s=RESPONSE_S,
+    )  # fmt: skip
+
+
+def _any_rate_std(rate: Floats) -> float:
+    """Return the standard deviation of a rate that was not measured [rad/s]: the rms rate of the drive."""
+    return max(float(np.sqrt(np.mean(rate**2))) if len(rate) else 0.0, LEAST_HOLE_STD_RADPS)
 
 
 def gyro_rates(
@@ -331,6 +344,10 @@ def _main_axis(turned: Floats, seconds: Floats, change: Floats) -> Floats | None
     return None if abs(axis[2]) > ALONG_AN_AXIS else np.asarray(axis, np.float64)
 
 
+COVERED_SHARE = 0.9
+"""Share of a hole of the gyro that the wheels must cover to bridge it."""
+
+
 def _bridged(t: Floats, rate: Floats, track: Track) -> TurnRate:
     """Return a gyro's rate with its holes bridged by the wheels' turn, scaled as the gyro shows it elsewhere."""
     long = np.flatnonzero(is_hole(np.diff(t), SHORTEST_HOLE_S))
@@ -345,8 +362,12 @@ def _bridged(t: Floats, rate: Floats, track: Track) -> TurnRate:
     left = there[known] - factor * apart[known]
     wheels = hole & (track.held > 0.0)
     order = np.argsort(np.concatenate([t, track.t[wheels]]), kind="stable")
+    # in a hole that the wheels do not cover either, the robot may turn as it does elsewhere
+    covered_s = np.interp(holes, track.t, np.concatenate([[0.0], np.cumsum(track.held[:-1])])) @ [-1.0, 1.0]
+    covered = covered_s > COVERED_SHARE * (holes[:, 1] - holes[:, 0])
+    by_wheels = float(np.sqrt(np.mean(left**2))) if len(left) else LEAST_HOLE_STD_RADPS
     return TurnRate(
         np.concatenate([t, track.t[wheels]])[order],
         np.concatenate([rate, factor * apart[wheels] + float(np.median(left))])[order],
-        holes, hole_std=float(np.sqrt(np.mean(left**2))) if len(left) else math.radians(10.0),
+        holes, hole_std=np.where(covered, by_wheels, _any_rate_std(rate)),
     )  # fmt: skip

@@ -167,6 +167,7 @@ def set_up_filter(
     icrs, icr_std = np.array(start.icrs_m), np.array(start.std_m)
     if sensors.facts.headings_are_precise:
         data = data._replace(turn_variance=_response_variance(data, float(icrs[0] - icrs[1])) + TURN_WANDER_RAD**2)
+    data = _without_lost_headings(data, config, sensors.facts.antenna_m)
     if not (len(gnss_t) and len(heading_t)):
         raise DataError(sensors.name, "the outages leave no fix or no heading", "shorten them")
     # the first stamp by which wheel, GNSS and heading have each been seen
@@ -179,6 +180,42 @@ def set_up_filter(
     parameters = _parameters(config, data, sensors, noise or configured_noise(config))
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
     return FilterSetup(data, t0, x0, P0, parameters)
+
+
+LOST_RAD = 0.5
+"""Standard deviation of a heading after a gap from which on it is lost [rad]: the filter is linear in the heading."""
+
+LOST_FIX_VARIANCE_M2 = 100.0
+"""Variance of a fix of an antenna aside of the body origin while the heading is lost [m^2]. With its own variance such
+a fix would turn the heading."""
+
+
+def _without_lost_headings(data: FilterInputs, config: Config, antenna_m: tuple[float, float]) -> FilterInputs:
+    """Return the inputs with wheel samples marked that follow a gap in wheels and headings, until the next heading.
+
+    They are not dead-reckoned, as a slip event is not: a pose that moves along a heading that is not known gives the
+    filter a wrong heading with a small standard deviation, by which it then rejects the measured headings.
+    """
+    if not config.filter.rules.corrects or len(data.wheel_t) < 2 or not len(data.heading_t):
+        return data
+    gaps = np.flatnonzero(np.diff(data.wheel_t) > wheel_gap_s(config, data.wheel_t))
+    lost, of_fixes = np.zeros(len(data.wheel_t), np.bool_), np.zeros(len(data.gnss_t), np.bool_)
+    for row in gaps.tolist():
+        end = data.wheel_t[row + 1]
+        after = int(np.searchsorted(data.heading_t, end))
+        seen = max(data.wheel_t[row], data.heading_t[after - 1]) if after else data.wheel_t[row]
+        if GAP_TURN_STD_RADPS * math.sqrt(end - seen) <= LOST_RAD or after == len(data.heading_t):
+            continue
+        until = data.heading_t[after]
+        # a sample is held until the next one: the heading is known in none of these
+        lost[row + 1 : np.searchsorted(data.wheel_t, until)] = True
+        of_fixes |= (data.gnss_t > seen) & (data.gnss_t <= until)
+    if not (lost.any() or of_fixes.any()):
+        return data
+    variance = data.gnss_r
+    if any(antenna_m):
+        variance = np.where(of_fixes[:, None], np.maximum(variance, LOST_FIX_VARIANCE_M2), variance)
+    return data._replace(slipping=data.slipping | lost if len(data.slipping) else lost, gnss_r=variance)
 
 
 def chi2_gate(probability: float, degrees: int) -> float:

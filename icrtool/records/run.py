@@ -352,6 +352,29 @@ def track_of(run: Run) -> Track:
     return track_of_states(run.table, run.in_gap, run.outages_ns, jumping=run.jumping, slipping=run.slipping)
 
 
+RECOVERED_RATIO = 2.0
+"""Ratio of a state's standard deviation to the usual one of the run, at most which the filter has recovered from a gap
+in the wheel data."""
+
+
+def _unrecovered(table: States, in_gap: Bools) -> Bools:
+    """Return which states (n,) follow a gap in the wheel data and are not known again as well as usual.
+
+    Until the first fix and the first heading after a gap a state is as uncertain as the motion in the gap.
+    """
+    found = np.zeros(len(table), np.bool_)
+    if not in_gap.any():
+        return found
+    poor = np.zeros(len(table), np.bool_)
+    for std in (np.hypot(table.std_north_m, table.std_east_m), table.std_heading_rad):
+        poor |= std > RECOVERED_RATIO * float(np.median(std))
+    good = np.flatnonzero(~poor)
+    for begin in np.flatnonzero(in_gap).tolist():
+        row = int(np.searchsorted(good, begin + 1))
+        found[begin + 1 : good[row] if row < len(good) else len(found)] = True
+    return found
+
+
 def track_of_states(
     table: States, in_gap: Bools, outages_ns: Ints, *, jumping: Bools | None = None, slipping: Bools | None = None
 ) -> Track:
@@ -363,6 +386,7 @@ def track_of_states(
     held = np.zeros(len(table))
     np.divide(np.diff(table.stamp_ns), 1e9, out=held[:-1])
     held[in_gap] = 0.0
+    held[_unrecovered(table, in_gap)] = 0.0
     return Track.of_states(
         table.t_s, held, table.v_left_mps, table.v_right_mps, table.north_m, table.east_m, table.heading_rad,
         table.distance_m, in_outage=in_outage, jump=jumping, slipping=slipping,
