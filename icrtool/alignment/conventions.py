@@ -159,6 +159,30 @@ def decide_conventions(
     return Decision(chosen, ranked[1] if close else None)
 
 
+class NamedFit(NamedTuple):
+    """How positions fit to wheels and heading as they are named.
+
+    Attributes
+    ----------
+    scatter : robust scatter of the displacements, as a share of their length; offset_rad : of the heading
+    turn_sigmas : turn of the heading by the wheels, clockwise for a faster left side, in standard deviations
+    """
+
+    scatter: float
+    offset_rad: float
+    turn_sigmas: float
+
+    @classmethod
+    def of(cls, windows: DriveWindows) -> NamedFit:
+        """Return the fit to the windows of a log."""
+        track = windows.track
+        laid = windows.laid, windows.over(track.at_places(track.half_difference * track.nose))
+        shown = _show(windows, laid, 1)
+        std = math.sqrt(max(float(shown.turn_covariance[0, 0]), 1e-24))
+        offset = math.atan2(float(shown.z[1]), float(shown.z[0]))
+        return cls(float(mad_std(shown.residuals, 0.0)), offset, float(shown.turn[0]) / std)
+
+
 def senses_by_distance(track: Track) -> Convention:
     """Return whether one side counts backwards, by distances alone: for a drive without a heading.
 

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from icrtool.alignment.align import align, choose_reference
+from icrtool.alignment.mirrored_positions import with_right_positions
 from icrtool.config import Config
 from icrtool.estimation.run_filter import run_filter
 from icrtool.estimation.run_filter import smooth as smooth_run
@@ -42,7 +43,7 @@ def fit_filter(
     """
     begin = watch if watch is not None else lambda _: None
     begin("aligning")
-    log = choose_reference(log, config)
+    log = with_right_positions(choose_reference(log, config), config)
     measurements = align(log, config)
     inputs, datum, rejected = log.inputs, log.datum, log.rejected_fixes
     # The log's columns that the filter does not use need half of the memory of the states.

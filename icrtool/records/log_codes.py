@@ -331,9 +331,9 @@ OF_POSITIONS: dict[str, Explanation] = {
     ),
     "positions_mirrored": Explanation(
         "info",
-        "East and west of the positions are exchanged.",
+        "The positions turn in the opposite sense to the robot: two of their axes, or the sign of one, are exchanged.",
         "They are exchanged back, except with preset `paper`.",
-        "Correct the frame of the position reference.",
+        "Correct the frame of the position reference, or the order and signs of latitude and longitude.",
     ),
     "gnss_float_as_fixed": Explanation(
         "warning",

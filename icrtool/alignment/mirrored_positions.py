@@ -1,0 +1,123 @@
+"""Geodetic positions that are mirrored: the sign of a latitude or longitude, or both exchanged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+from icrtool.alignment.clock_search import with_configured_delays
+from icrtool.alignment.conventions import NamedFit, gyro_sense
+from icrtool.alignment.log_track import FEWEST_OVERLAPPING, check_streams, windows_of_log
+from icrtool.alignment.wheel_units import with_wheel_speeds
+from icrtool.config import Config
+from icrtool.errors import ConfigError, DataError
+from icrtool.records.notes import note
+from icrtool.records.run import width_or_usual_m
+from icrtool.records.samples import Datum, PositionFixes
+from icrtool.records.tables import RobotLog
+
+WITNESS_SIGMAS = 5.0
+"""Turn of the heading by the wheels, in its standard deviations, from which on both turn in one sense."""
+
+BETTER_FIT_RATIO = 0.5
+"""Ratio of the scatter of displacements with and without exchanged axes below which the axes are exchanged."""
+
+EQUAL_FIT_RATIO = 1.1
+"""Ratio of the scatters of two exchanges up to which the heading's offset decides between them."""
+
+EARTH_RADIUS_M, EARTH_ECCENTRICITY_2 = 6_378_137.0, 6.694379990141e-3
+"""Equatorial radius [m] and squared eccentricity of the ellipsoid WGS 84."""
+
+
+def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
+    """Return the log with its geodetic positions, and their datum, exchanged back where they are mirrored.
+
+    Gyro, heading and wheels are three witnesses of the sense in which the robot turns. Where they agree, and the course
+    over ground turns in the other sense, the positions are mirrored. Preset ``paper`` corrects nothing.
+    """
+    if log.datum is None or log.gyro is None or not len(log.heading.stamp_ns) or not config.filter.rules.corrects:
+        return log
+    width = width_or_usual_m(config.robot.track_width_m)
+    moved, inner, _ = with_configured_delays(log, config)
+    try:
+        named = with_wheel_speeds(moved, inner)
+        check_streams(named)
+    except (ConfigError, DataError):
+        # it is refused later, with its reason
+        return log
+    windows = windows_of_log(named, width)
+    if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
+        return log
+    as_sent = NamedFit.of(windows)
+    if as_sent.turn_sigmas < WITNESS_SIGMAS or gyro_sense(named, windows.track) <= 0:
+        return log
+    found = []
+    for words, exchange in EXCHANGES:
+        one = exchange(log, log.datum)
+        if one is None:
+            continue
+        fixes = one.gnss
+        track = windows.track._replace(north=fixes.north_m, east=fixes.east_m)
+        found.append((NamedFit.of(replace(windows, track=track)), words, one))
+    least = min((fit.scatter for fit, _, _ in found), default=math.inf)
+    if not least < BETTER_FIT_RATIO * as_sent.scatter:
+        return log
+    near = [one for one in found if one[0].scatter <= EQUAL_FIT_RATIO * least]
+    _, words, right = min(near, key=lambda one: abs(one[0].offset_rad))
+    why = (
+        f"the positions turn in the opposite sense to gyro, heading and wheels, which agree: {words}; corrected: the "
+        f"displacements scatter by {100 * least:.1f} % of their length in place of {100 * as_sent.scatter:.0f} %"
+    )
+    return replace(right, notes=(*right.notes, note("positions_mirrored", why, log.name)))
+
+
+def _exchanged(log: RobotLog, datum: Datum, exchange: Callable[[PositionFixes], PositionFixes]) -> RobotLog:
+    """Return a log with another datum and exchanged positions of all its receivers."""
+    others = tuple(replace(one, fixes=exchange(one.fixes)) for one in log.other_receivers)
+    return replace(log, datum=datum, gnss=exchange(log.gnss), other_receivers=others)
+
+
+def _other_longitude(log: RobotLog, datum: Datum) -> RobotLog | None:
+    return _exchanged(
+        log, replace(datum, longitude_deg=-datum.longitude_deg),
+        lambda one: replace(one, east_m=-one.east_m, cov_north_east_m2=-one.cov_north_east_m2),
+    )  # fmt: skip
+
+
+def _other_latitude(log: RobotLog, datum: Datum) -> RobotLog | None:
+    return _exchanged(
+        log, replace(datum, latitude_deg=-datum.latitude_deg),
+        lambda one: replace(one, north_m=-one.north_m, cov_north_east_m2=-one.cov_north_east_m2),
+    )  # fmt: skip
+
+
+def _both_exchanged(log: RobotLog, datum: Datum) -> RobotLog | None:
+    """Return the log with latitude and longitude exchanged; None where the longitude cannot be a latitude."""
+    if abs(datum.longitude_deg) >= 90.0:
+        return None
+    of_north, of_east = metres_per_radian(datum.latitude_deg)
+    to_north, to_east = metres_per_radian(datum.longitude_deg)
+    north, east = to_north / of_east, to_east / of_north
+    return _exchanged(
+        log, Datum(datum.longitude_deg, datum.latitude_deg, datum.height_m),
+        lambda one: replace(
+            one, north_m=north * one.east_m, east_m=east * one.north_m, var_north_m2=north**2 * one.var_east_m2,
+            var_east_m2=east**2 * one.var_north_m2, cov_north_east_m2=north * east * one.cov_north_east_m2,
+        ),
+    )  # fmt: skip
+
+
+def metres_per_radian(latitude_deg: float) -> tuple[float, float]:
+    """Return metres to the north per radian of latitude, and to the east per radian of longitude (WGS 84)."""
+    phi = math.radians(latitude_deg)
+    w = math.sqrt(1.0 - EARTH_ECCENTRICITY_2 * math.sin(phi) ** 2)
+    return EARTH_RADIUS_M * (1.0 - EARTH_ECCENTRICITY_2) / w**3, EARTH_RADIUS_M * math.cos(phi) / w
+
+
+EXCHANGES: tuple[tuple[str, Callable[[RobotLog, Datum], RobotLog | None]], ...] = (
+    ("the longitude has the other sign", _other_longitude),
+    ("the latitude has the other sign", _other_latitude),
+    ("latitude and longitude are exchanged", _both_exchanged),
+)
+"""What may be wrong with geodetic positions, in words, and the log without it."""
