@@ -151,6 +151,12 @@ OF_WHEELS: dict[str, Explanation] = {
         "ICRs and multiplier of the whole drive lie between the values of its stretches.",
         "Fit with `--terrain-change T`, or each stretch by itself with `--from` and `--to`.",
     ),
+    "wheels_from_pose": Explanation(
+        "warning",
+        "The twist of an odometry stays 0 while its pose moves.",
+        "Way and turn of the pose are taken as wheel odometry.",
+        "Let the driver fill the twist, or record the wheels; `topics.wheels` chooses a topic.",
+    ),
     "wheels_commanded": Explanation(
         "warning",
         "No measured wheel speeds were found: the topic holds commanded ones.",

@@ -16,7 +16,7 @@ from icrtool.logs.streams.headings import Bearing, Orientation
 from icrtool.logs.streams.joints import Joints
 from icrtool.logs.streams.positions import Fix, Solution
 from icrtool.logs.streams.sources import Source
-from icrtool.logs.streams.wheels import FixedWheels, Twist
+from icrtool.logs.streams.wheels import FixedWheels, Odometry, Twist
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX, RTK_FIX, Role
 
 
@@ -215,7 +215,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         # its motor rpm is integer, and before the gearbox
         "scout_msgs/ScoutStatus": _AGILEX,
         "bunker_msgs/BunkerStatus": _AGILEX,
-        "nav_msgs/Odometry": Twist("twist of the wheel odometry", 60.0, "twist.twist.", fused=50.0),
+        "nav_msgs/Odometry": Odometry("twist of the wheel odometry", 60.0, "twist.twist.", fused=50.0),
         "geometry_msgs/TwistStamped": replace(_TWIST, path="twist."),
         "geometry_msgs/TwistWithCovarianceStamped": replace(_TWIST, path="twist.twist."),
         "geometry_msgs/Twist": replace(_TWIST, worth=40.0),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, unwrapped
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
-from icrtool.logs.streams.sources import Sides, WheelSource, motion_of, moves, of_topic
+from icrtool.logs.streams.sources import NEVER_MOVES, Sides, WheelSource, motion_of, moves, of_topic
 from icrtool.records.notes import Note, note
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import listed
@@ -241,7 +241,11 @@ class Twist:
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
         """Return the twist; a twist of a position reference, or in east and north, is refused."""
-        forward, sideways, turn = self.fields
+        return self.of_twist(table)
+
+    def of_twist(self, table: TopicTable) -> WheelSource:
+        """Return the twist of a topic."""
+        forward, sideways, turn = (f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn))
         twist = np.column_stack([table.column(forward), table.column(turn)]).astype(np.float64)
         forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], table.floats(sideways)))
         score, why, known = (
@@ -258,6 +262,66 @@ class Twist:
         elif self.fused and REFERENCE_WORDS.search(table.topic):
             problem = "its name is the name of a position reference, not of wheels"
         return motion_of(**of_topic(table), twist=twist, unit="m", score=score, why=why, notes=known, problem=problem)
+
+
+POSE_PATH = "pose.pose."
+POSE_FIELDS = tuple(
+    f"{POSE_PATH}{one}" for one in ("position.x", "position.y", *(f"orientation.{axis}" for axis in "xyzw"))
+)
+"""The fields of an odometry's pose."""
+
+LEAST_WAY_M, LEAST_POSE_TURN_RAD = 1.0, 0.5
+"""Way and turn of a pose [m, rad] from which on it moves while its twist stays 0."""
+
+POSE_PENALTY = 20.0
+"""Subtracted from the score of an odometry whose twist stays 0: one with a twist is preferred."""
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry(Twist):
+    """A message type with the velocity of the body and its pose by the wheels; the pose counts if the velocity is 0."""
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields that are read."""
+        return (*(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn)), *POSE_FIELDS)
+
+    def read(self, table: TopicTable, _: Config) -> WheelSource:
+        """Return the twist; where it stays 0 while the pose moves, the way and the turn of the pose."""
+        found = self.of_twist(table)
+        if found.twist is None or moves(found.twist) or not all(path in table.columns for path in POSE_FIELDS):
+            return found
+        travelled = travelled_by(*(table.floats(path) for path in POSE_FIELDS))
+        if travelled is None:
+            return found
+        why = (
+            f"{table.topic}: its twist stays 0 while its pose goes {travelled[-1, 0]:.1f} m forward: way and turn of "
+            "the pose are taken as wheel odometry; topics.wheels names another topic"
+        )
+        score = found.score + NEVER_MOVES - POSE_PENALTY
+        words = "pose of the wheel odometry (its twist stays 0), converted to wheel speeds with the track width"
+        return replace(
+            found, travelled=travelled, score=score, why=words,
+            notes=(*found.notes, note("wheels_from_pose", why)),
+        )  # fmt: skip
+
+
+def travelled_by(x: Floats, y: Floats, qx: Floats, qy: Floats, qz: Floats, qw: Floats) -> Floats | None:
+    """Return way forward [m] and turn [rad] (n, 2) of poses; None where they do not move and turn.
+
+    The way of a step is its displacement along the heading in its middle: exact to the second order on an arc.
+    """
+    sound = np.isfinite(x) & np.isfinite(y) & np.isfinite(qx + qy + qz + qw) & (qz**2 + qw**2 > 0.0)
+    if np.count_nonzero(sound) < len(x) or len(x) < 2:
+        return None
+    yaw = unwrapped(np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2))
+    middle, turn = (yaw[1:] + yaw[:-1]) / 2.0, np.diff(yaw)
+    chord = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)
+    # the chord of an arc is shorter than the arc
+    step = chord / np.sinc(turn / (2.0 * np.pi))
+    if float(np.abs(step).sum()) < LEAST_WAY_M or float(np.ptp(yaw)) < LEAST_POSE_TURN_RAD:
+        return None
+    return np.column_stack([np.append(0.0, np.cumsum(step)), yaw - yaw[0]])
 
 
 WHEEL_WORDS = re.compile(r"wheel|track(?!er|ing)|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
