@@ -264,9 +264,9 @@ class Twist:
         return motion_of(**of_topic(table), twist=twist, unit="m", score=score, why=why, notes=known, problem=problem)
 
 
-POSE_PATH = "pose.pose."
-POSE_FIELDS = tuple(
-    f"{POSE_PATH}{one}" for one in ("position.x", "position.y", *(f"orientation.{axis}" for axis in "xyzw"))
+ODOMETRY_POSE_PATH = "pose.pose."
+ODOMETRY_POSE = tuple(
+    f"{ODOMETRY_POSE_PATH}{one}" for one in ("position.x", "position.y", *(f"orientation.{axis}" for axis in "xyzw"))
 )
 """The fields of an odometry's pose."""
 
@@ -284,14 +284,14 @@ class Odometry(Twist):
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        return (*(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn)), *POSE_FIELDS)
+        return (*(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn)), *ODOMETRY_POSE)
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
         """Return the twist; where it stays 0 while the pose moves, the way and the turn of the pose."""
         found = self.of_twist(table)
-        if found.twist is None or moves(found.twist) or not all(path in table.columns for path in POSE_FIELDS):
+        if found.twist is None or moves(found.twist) or not all(path in table.columns for path in ODOMETRY_POSE):
             return found
-        travelled = travelled_by(*(table.floats(path) for path in POSE_FIELDS))
+        travelled = travelled_by(*(table.floats(path) for path in ODOMETRY_POSE))
         if travelled is None:
             return found
         why = (
