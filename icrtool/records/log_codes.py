@@ -154,7 +154,7 @@ OF_WHEELS: dict[str, Explanation] = {
     "wheels_from_pose": Explanation(
         "warning",
         "The twist of an odometry stays 0 while its pose moves.",
-        "Way and turn of the pose are taken as wheel odometry.",
+        "Distance and turn of the pose are taken as wheel odometry.",
         "Let the driver fill the twist, or record the wheels; `topics.wheels` chooses a topic.",
     ),
     "wheels_commanded": Explanation(

@@ -392,8 +392,8 @@ def _pick(motion: WheelSource, config: Config) -> tuple[Floats, Floats, WheelUni
             why = f"needed to convert the body twist of {motion.topic} to wheel speeds"
             raise ConfigError("robot.track_width_m", why, "give it, or --robot NAME")
         if motion.travelled is not None:
-            way, turn = motion.travelled.T
-            return way - turn * width / 2, way + turn * width / 2, "m", True
+            travel, turn = motion.travelled.T
+            return travel - turn * width / 2, travel + turn * width / 2, "m", True
         speed, turn = motion.twist.T
         with np.errstate(over="ignore", invalid="ignore"):
             return speed - turn * width / 2, speed + turn * width / 2, "m", False

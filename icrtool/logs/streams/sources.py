@@ -312,7 +312,7 @@ class WheelSource(Source):
     speed : in `unit` per second; None where not recorded
     twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only the body's motion is
         recorded
-    travelled : (n, 2) way forward [m] and turn [rad, counter-clockwise] since some start, of a body whose twist stays 0
+    travelled : (n, 2) distance forward [m] and turn [rad, counter-clockwise] since some start, where the twist stays 0
     joints : the joints that its messages list by name, where they do
     """
 

@@ -270,8 +270,8 @@ ODOMETRY_POSE = tuple(
 )
 """The fields of an odometry's pose."""
 
-LEAST_WAY_M, LEAST_POSE_TURN_RAD = 1.0, 0.5
-"""Way and turn of a pose [m, rad] from which on it moves while its twist stays 0."""
+LEAST_POSE_TRAVEL_M, LEAST_POSE_TURN_RAD = 1.0, 0.5
+"""Distance and turn of a pose [m, rad] from which on it moves while its twist stays 0."""
 
 POSE_PENALTY = 20.0
 """Subtracted from the score of an odometry whose twist stays 0: one with a twist is preferred."""
@@ -287,7 +287,7 @@ class Odometry(Twist):
         return (*(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn)), *ODOMETRY_POSE)
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
-        """Return the twist; where it stays 0 while the pose moves, the way and the turn of the pose."""
+        """Return the twist; where it stays 0 while the pose moves, the distance and the turn of the pose."""
         found = self.of_twist(table)
         if found.twist is None or moves(found.twist) or not all(path in table.columns for path in ODOMETRY_POSE):
             return found
@@ -295,8 +295,8 @@ class Odometry(Twist):
         if travelled is None:
             return found
         why = (
-            f"{table.topic}: its twist stays 0 while its pose goes {travelled[-1, 0]:.1f} m forward: way and turn of "
-            "the pose are taken as wheel odometry; topics.wheels names another topic"
+            f"{table.topic}: its twist stays 0 while its pose goes {travelled[-1, 0]:.1f} m forward: distance and turn "
+            "of the pose are taken as wheel odometry; topics.wheels names another topic"
         )
         score = found.score + NEVER_MOVES - POSE_PENALTY
         words = "pose of the wheel odometry (its twist stays 0), converted to wheel speeds with the track width"
@@ -307,9 +307,9 @@ class Odometry(Twist):
 
 
 def travelled_by(x: Floats, y: Floats, qx: Floats, qy: Floats, qz: Floats, qw: Floats) -> Floats | None:
-    """Return way forward [m] and turn [rad] (n, 2) of poses; None where they do not move and turn.
+    """Return distance forward [m] and turn [rad] (n, 2) of poses; None where they do not move and turn.
 
-    The way of a step is its displacement along the heading in its middle: exact to the second order on an arc.
+    The distance of a step is its displacement along the heading in its middle: exact to the second order on an arc.
     """
     sound = np.isfinite(x) & np.isfinite(y) & np.isfinite(qx + qy + qz + qw) & (qz**2 + qw**2 > 0.0)
     if np.count_nonzero(sound) < len(x) or len(x) < 2:
@@ -319,7 +319,7 @@ def travelled_by(x: Floats, y: Floats, qx: Floats, qy: Floats, qz: Floats, qw: F
     chord = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)
     # the chord of an arc is shorter than the arc
     step = chord / np.sinc(turn / (2.0 * np.pi))
-    if float(np.abs(step).sum()) < LEAST_WAY_M or float(np.ptp(yaw)) < LEAST_POSE_TURN_RAD:
+    if float(np.abs(step).sum()) < LEAST_POSE_TRAVEL_M or float(np.ptp(yaw)) < LEAST_POSE_TURN_RAD:
         return None
     return np.column_stack([np.append(0.0, np.cumsum(step)), yaw - yaw[0]])
 

@@ -1,4 +1,4 @@
-"""Odometry whose twist stays 0 while its pose moves: the way and the turn of the pose are the wheels."""
+"""Odometry whose twist stays 0 while its pose moves: the distance and the turn of the pose are the wheels."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_a_pose_that_stands_or_never_turns_is_not_the_wheels() -> None:
         assert read(odometry(one)).travelled is None
 
 
-def test_the_way_of_an_arc_is_its_length() -> None:
+def test_the_distance_of_an_arc_is_its_length() -> None:
     angle = np.linspace(0.0, 6.0, 25)
     zero = np.zeros(len(angle))
     found = travelled_by(
