@@ -1,7 +1,12 @@
 """One decorator for every compiled kernel, and where its machine code is kept.
 
 numba compiles a kernel when it is first called on a computer. The object file is kept, and later processes run it
-through llvmlite, the library below numba, because to import numba takes longer than all other imports of a command.
+through llvmlite, the library below numba, because to import numba takes longer than all other imports of a command:
+0.6 s of CPU and 64 MB for each command.
+
+The machine code is called as numba calls it, which numba does not publish. Therefore a small kernel is compiled and
+compared with Python before anything is kept (`passes_as_expected`). Where it differs, or a part of numba that is not
+public is missing, kernels are plain ``numba.njit(cache=True)``.
 """
 
 from __future__ import annotations
@@ -16,7 +21,7 @@ import stat
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -182,50 +187,156 @@ class Kernel:
             with _lock:
                 # another thread may have been first
                 if types not in self._functions:
-                    code = self._machine_code(types, values, arguments)
-                    self._functions[types] = code and code.function(arguments.forms)
+                    self._functions[types] = self._function(types, values, arguments)
         run = self._functions[types]
         return run(arguments.words) if run else self._by_numba(*values)
 
     @functools.cached_property
     def _by_numba(self) -> Callable[..., Result]:
-        """Return the function as numba itself calls it, which keeps nothing."""
-        by_numba: Callable[..., Result] = _numba().njit(**_OPTIONS)(self.py_func)
-        return by_numba
+        """Return the function as numba itself calls and keeps it."""
+        with _lock:
+            return _plain_njit(self.py_func)
 
-    def _machine_code(
+    def _function(
         self, types: tuple[object, ...], values: Sequence[object], arguments: _Arguments
-    ) -> MachineCode | None:
-        """Return the machine code that is kept, or that numba makes now; None where numba alone can run it."""
+    ) -> Callable[[Sequence[object]], Result] | None:
+        """Return what runs the machine code that is kept, or is made now; None where numba alone can run it."""
         name = f"{self.py_func.__module__.rpartition('.')[2]}.{self.py_func.__qualname__}"
         file = f"{name}-{hashlib.sha256(repr((_stamp(), types)).encode()).hexdigest()[:24]}.o"
         for place in cache_places() if _stamp() else ():
             if kept := MachineCode.read(place / file):
-                return kept
+                return _loaded(kept, arguments.forms)
         self.compiled += 1
         for watch in _watchers:
             watch()
-        numba = _numba()
-        dispatcher = numba.njit(**_BARE)(self.py_func)
-        dispatcher.compile(tuple(numba.typeof(_writable(one)) for one in values))
-        [signature] = dispatcher.nopython_signatures
-        module, result = llvm.parse_assembly(dispatcher.inspect_llvm(signature.args)), signature.return_type
-        called = {one.name for one in module.functions if one.is_declaration and not one.name.startswith("llvm.")}
-        # where a version of numba passes arguments otherwise, there is no such function
-        expected = [_LLVM_TYPES[form] for form in [_POINTER, _POINTER, *arguments.forms]]
-        entries = [
-            one.name
-            for one in module.functions
-            if not one.is_declaration
-            and ["ptr" if word.type.is_pointer else str(word.type) for word in one.arguments] == expected
-        ]
-        returned = str(numba.types.unliteral(result))
-        if not called <= _MATHEMATICS or len(entries) != 1 or returned not in _RESULTS:
-            return None
-        code = MachineCode(entries[0], returned, _machine(numba.config.OPT).emit_object(module))
-        if _stamp():
+        code = None
+        if passes_as_expected():
+            _mark_parts()
+            code = machine_code(self.py_func, values, arguments.forms)
+        if code is not None and _stamp():
             _keep(file, code.written())
-        return code
+        return _loaded(code, arguments.forms)
+
+
+def _loaded(code: MachineCode | None, forms: Sequence[Any]) -> Callable[[Sequence[object]], Result] | None:
+    """Return what runs machine code; None where there is none, or llvmlite of this version cannot load it."""
+    try:
+        return code and code.function(forms)
+    except Exception:  # noqa: BLE001 - whatever llvmlite says: numba runs the kernel
+        return None
+
+
+def machine_code(function: Callable[..., Any], values: Sequence[object], forms: Sequence[Any]) -> MachineCode | None:
+    """Return what numba makes of a function for arguments of some types.
+
+    Parameters
+    ----------
+    values, forms : examples of the arguments, and the C types of their words
+
+    Returns
+    -------
+    MachineCode or None
+        None where numba of this version does or names something differently, and where the machine code needs numba.
+    """
+    try:
+        return _machine_code(function, values, forms)
+    except Exception:  # noqa: BLE001 - a part of numba that is not public may fail in any way
+        return None
+
+
+def _machine_code(function: Callable[..., Any], values: Sequence[object], forms: Sequence[Any]) -> MachineCode | None:
+    numba = _numba()
+    dispatcher = numba.njit(**_BARE)(function)
+    dispatcher.compile(tuple(numba.typeof(_writable(one)) for one in values))
+    [signature] = dispatcher.nopython_signatures
+    module, result = llvm.parse_assembly(dispatcher.inspect_llvm(signature.args)), signature.return_type
+    called = {one.name for one in module.functions if one.is_declaration and not one.name.startswith("llvm.")}
+    # where a version of numba passes arguments otherwise, there is no such function
+    expected = [_LLVM_TYPES[form] for form in [_POINTER, _POINTER, *forms]]
+    entries = [
+        one.name
+        for one in module.functions
+        if not one.is_declaration
+        and ["ptr" if word.type.is_pointer else str(word.type) for word in one.arguments] == expected
+    ]
+    returned = str(numba.types.unliteral(result))
+    if not called <= _MATHEMATICS or len(entries) != 1 or returned not in _RESULTS:
+        return None
+    return MachineCode(entries[0], returned, _machine(numba.config.OPT).emit_object(module))
+
+
+class _Example(NamedTuple):
+    """An array and a flag, passed as one argument."""
+
+    weights: np.ndarray[Any, Any]
+    doubled: bool
+
+
+def _scaled(weight: float, factor: float) -> float:
+    """Return a product: a part of a kernel."""
+    return weight * factor
+
+
+def _fill(sums: np.ndarray[Any, Any], example: _Example, count: int, factor: float, shift: float | None) -> float:
+    """Fill `sums` (m, 2); return its last number: a kernel with an argument of each kind."""
+    for i in range(sums.shape[0]):
+        for j in range(sums.shape[1]):
+            sums[i, j] = count * _scaled(example.weights[i], factor) + 10 * i + j
+            if example.doubled:
+                sums[i, j] *= 2
+            if shift is not None:
+                sums[i, j] += shift
+    return float(sums[-1, -1])
+
+
+def _clear(sums: np.ndarray[Any, Any]) -> None:
+    """Set all numbers to 0: a kernel without a result."""
+    sums[:] = 0.0
+
+
+@functools.cache
+def passes_as_expected() -> bool:
+    """Return whether machine code of this numba takes and returns values as `Kernel` expects.
+
+    Two small kernels must give what Python gives. It takes 0.3 s of CPU, once in a process that compiles.
+    """
+    try:
+        _numba()
+        _mark(_scaled, _BARE)
+        return _gives_the_same(_fill, _Example(np.array([0.5, 3.0, 1.25]), True), 7, 0.75, None) and _gives_the_same(
+            _clear
+        )
+    except Exception:  # noqa: BLE001 - a part of numba that is not public may fail in any way
+        return False
+
+
+def _gives_the_same(function: Callable[..., Any], *given: object) -> bool:
+    """Return whether machine code fills an array as the Python function does, and returns the same."""
+    theirs, ours = np.full((3, 2), 5.0), np.full((3, 2), 5.0)
+    arguments = _Arguments((ours, *given))
+    run = _loaded(machine_code(function, (ours, *given), arguments.forms), arguments.forms)
+    return run is not None and run(arguments.words) == function(theirs, *given) and np.array_equal(theirs, ours)
+
+
+def _plain_njit(function: Callable[..., Any]) -> Callable[..., Result]:
+    """Return a function as ``numba.njit(cache=True)`` makes it; without the cache where no place can be written.
+
+    Numba looks only at the file of the function to see whether it has changed. Therefore its folder is named by all
+    kernels.
+    """
+    numba, place, stamp = _numba(), writable_place(), _stamp()
+    _mark_parts()
+    if place is not None and stamp:
+        folder = place / f"numba-{hashlib.sha256(repr(stamp).encode()).hexdigest()[:24]}"
+        with suppress(OSError, RuntimeError, AttributeError):
+            folder.mkdir(mode=0o755, exist_ok=True)
+            if _is_own(place) and _is_own(folder):
+                before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+                try:
+                    return cast(Callable[..., Result], numba.njit(cache=True, **_OPTIONS)(function))
+                finally:
+                    numba.config.CACHE_DIR = before
+    return cast(Callable[..., Result], numba.njit(**_OPTIONS)(function))
 
 
 @contextmanager
@@ -249,23 +360,33 @@ def _writable(value: object) -> object:
 
 
 def _numba() -> ModuleType:
-    """Return numba, loaded without scipy's BLAS, with the parts of kernels that were marked until now.
+    """Return numba, loaded without scipy's BLAS.
 
     The search for BLAS takes longer than the rest of the import. No kernel multiplies matrices; numba searches again
     when a function of another package does.
     """
-    numba, extending = (importlib.import_module(name) for name in ("numba", "numba.extending"))
+    numba = importlib.import_module("numba")
     blas = "scipy.linalg.cython_blas"
     if blas not in sys.modules:
         sys.modules[blas] = None  # type: ignore[assignment]  # Python's mark for "cannot be imported"
         try:
-            importlib.import_module("numba.np.arraymath")
+            with suppress(ImportError):
+                importlib.import_module("numba.np.arraymath")
         finally:
             del sys.modules[blas]
-    while _parts:
-        part = _parts.pop()
-        extending.overload(part, jit_options=_BARE, strict=False, prefer_literal=True)(lambda *_, part=part: part)
     return numba
+
+
+def _mark_parts() -> None:
+    """Tell numba of the parts of kernels that were marked until now."""
+    options = _BARE if passes_as_expected() else _OPTIONS
+    while _parts:
+        _mark(_parts.pop(), options)
+
+
+def _mark(part: Callable[..., Any], options: Mapping[str, object]) -> None:
+    extending = importlib.import_module("numba.extending")
+    extending.overload(part, jit_options=dict(options), strict=False, prefer_literal=True)(lambda *_: part)
 
 
 def _machine(level: int = 0) -> llvm.TargetMachine:

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import pytest
 
@@ -38,14 +39,26 @@ def test_kernels_compile_where_no_cache_can_be_written() -> None:
     assert called(os.devnull + "/cache") == ["1.5", "1", "True"]
 
 
-def test_a_process_needs_no_compiler_where_machine_code_is_kept(tmp_path: Path) -> None:
-    assert [called(tmp_path), called(tmp_path)] == [["1.5", "1", "True"], ["1.5", "0", "False"]]
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which one process kept a kernel."""
+    folder = tmp_path_factory.mktemp("made")
+    assert called(folder) == ["1.5", "1", "True"]
+    return folder
 
 
-def test_machine_code_is_as_readable_as_other_files(tmp_path: Path) -> None:
-    called(tmp_path)
-    [file] = tmp_path.iterdir()
-    other = tmp_path / "other"
+@pytest.fixture
+def place(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "place"))
+
+
+def test_a_process_needs_no_compiler_where_machine_code_is_kept(place: Path) -> None:
+    assert called(place) == ["1.5", "0", "False"]
+
+
+def test_machine_code_is_as_readable_as_other_files(made: Path) -> None:
+    [file] = made.iterdir()
+    other = made.parent / "other"
     other.touch()
     assert file.stat().st_mode == other.stat().st_mode
 
@@ -53,12 +66,18 @@ def test_machine_code_is_as_readable_as_other_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "damage", [lambda data: data[:-100], lambda data: data + b"x", lambda _: b""], ids=("cut", "longer", "empty")
 )
-def test_damaged_machine_code_is_compiled_again(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
-    called(tmp_path)
-    [file] = tmp_path.iterdir()
+def test_damaged_machine_code_is_not_run(place: Path, damage: Callable[[bytes], bytes]) -> None:
+    [file] = place.iterdir()
+    assert compiled.MachineCode.read(file) is not None
+    file.write_bytes(damage(file.read_bytes()))
+    assert compiled.MachineCode.read(file) is None
+
+
+def test_damaged_machine_code_is_compiled_again(place: Path) -> None:
+    [file] = place.iterdir()
     whole = file.read_bytes()
-    file.write_bytes(damage(whole))
-    assert called(tmp_path) == ["1.5", "1", "True"]
+    file.write_bytes(whole[:-100])
+    assert called(place) == ["1.5", "1", "True"]
     assert file.read_bytes() == whole
 
 
@@ -96,11 +115,86 @@ def test_machine_code_takes_what_the_python_function_takes(given: tuple[Any, ...
     assert kernel.compiled == 0
 
 
-def test_numba_runs_what_it_passes_arguments_to_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(compiled._LLVM_TYPES, compiled._INTEGER, "i128")
-    kernel = njit(weigh)
-    assert kernel(*arguments()) == pytest.approx(weigh(*arguments()), abs=1e-12)
-    assert not list(cache_places()[0].glob("*"))
+def patched_flags(patch: pytest.MonkeyPatch) -> None:
+    """Pass flags the other way round, as a version of numba might: the form of the arguments stays."""
+    add = compiled._Arguments._add
+
+    def changed(self: Any, value: object) -> None:
+        add(self, value)
+        if isinstance(value, bool):
+            self.words[-1] = not value
+
+    patch.setattr(compiled._Arguments, "_add", changed)
+
+
+def raises(*_: object, **__: object) -> Any:
+    raise NotImplementedError("of another version")
+
+
+DISPATCHER = type(numba.njit(weigh))
+
+
+def turn_over(values: np.ndarray[Any, Any], flag: bool) -> float:
+    for i in range(len(values) if flag else 0):
+        values[i] = 2 - i
+    return values[0] + 7.0
+
+
+OTHERWISE: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
+    "an option is not known": lambda patch: patch.setattr(compiled, "_BARE", {**compiled._BARE, "_gone": True}),
+    "no signatures": lambda patch: patch.setattr(DISPATCHER, "nopython_signatures", property(raises)),
+    "no text of LLVM": lambda patch: patch.setattr(DISPATCHER, "inspect_llvm", raises),
+    "another text of LLVM": lambda patch: patch.setattr(DISPATCHER, "inspect_llvm", lambda *_: "other"),
+    "other words": lambda patch: patch.setitem(compiled._LLVM_TYPES, compiled._INTEGER, "i128"),
+    "words that mean something else": patched_flags,
+    "another sign of success": lambda patch: patch.setattr(compiled, "_RETURNED", (7,)),
+    "llvmlite loads no object": lambda patch: patch.setattr(compiled.llvm, "create_mcjit_compiler", raises),
+    "no overloads with options": lambda patch: patch.setattr(numba.extending, "overload", raises),
+}
+"""What a version of numba or llvmlite may do otherwise, in each part that is used and not public."""
+
+
+@pytest.mark.parametrize("otherwise", OTHERWISE)
+def test_where_numba_differs_a_kernel_is_plain_njit_with_its_cache(
+    monkeypatch: pytest.MonkeyPatch, otherwise: str
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(compiled, "_parts", [])
+        OTHERWISE[otherwise](patch)
+        compiled.passes_as_expected.cache_clear()
+        values = np.arange(3.0)
+        assert njit(turn_over)(values, True) == 9.0
+        assert not compiled.passes_as_expected()
+    compiled.passes_as_expected.cache_clear()
+    assert values.tolist() == [2.0, 1.0, 0.0]
+    [folder] = cache_places()[0].iterdir()
+    assert folder.name.startswith("numba-")
+    assert list(folder.rglob("*.nbc"))
+    assert not list(folder.rglob("*.o"))
+
+
+def test_numba_finds_its_own_cache_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "_RETURNED", (7,))
+    compiled.passes_as_expected.cache_clear()
+    hits = []
+    for _ in range(2):
+        kernel = njit(weigh)
+        kernel(*arguments())
+        hits.append(sum(kernel._by_numba.stats.cache_hits.values()))
+    compiled.passes_as_expected.cache_clear()
+    assert hits == [0, 1]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="a folder has no owner here")
+def test_numba_keeps_nothing_where_others_may_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "_RETURNED", (7,))
+    compiled.passes_as_expected.cache_clear()
+    place = cache_places()[0]
+    place.mkdir()
+    place.chmod(0o777)
+    assert njit(weigh)(*arguments()) == pytest.approx(weigh(*arguments()), abs=1e-12)
+    compiled.passes_as_expected.cache_clear()
+    assert not list(place.rglob("*.nbc"))
 
 
 def rise(value: float) -> float:
@@ -109,7 +203,7 @@ def rise(value: float) -> float:
 
 def test_numba_runs_what_calls_more_than_the_known_functions() -> None:
     assert njit(rise)(0.5) == pytest.approx(math.log1p(0.5))
-    assert not list(cache_places()[0].glob("*"))
+    assert not list(cache_places()[0].rglob("*.o"))
 
 
 def double(value: float) -> float:
