@@ -9,17 +9,23 @@ shift
 python=${PYTHON:-python3}
 
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Error: Python " + sys.version.split()[0] + ": too old; icrtool needs 3.11 or newer: PYTHON=python3.11 container-setup.sh ...")'
+# uv, where there is one, installs in a quarter of pip's CPU time. Where it fails, as with an index set for pip, pip does.
 "$python" -m venv "$place"
 place=$(cd "$place" && pwd)
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 # `cache warm` compiles the modules that it loads: all of them would take as long as the rest.
 export PYTHONDONTWRITEBYTECODE=
-pip=("$place/bin/python" -m pip --disable-pip-version-check install --quiet --no-compile --no-deps)
+install() {
+    if command -v uv >/dev/null && uv pip install --quiet --no-config --no-deps --python "$place/bin/python" "$@"; then
+        return
+    fi
+    "$place/bin/python" -m pip --disable-pip-version-check install --quiet --no-compile --no-deps "$@"
+}
 
 "$place/bin/python" "$source/scripts/pinned_requirements.py" "$@" >"$scratch/pinned.txt"
-"${pip[@]}" --require-hashes -r "$scratch/pinned.txt"
-"${pip[@]}" --no-build-isolation "$source"
+install --require-hashes -r "$scratch/pinned.txt"
+install --no-build-isolation "$source"
 
 cat >>"$place/bin/activate" <<'ACTIVATE'
 

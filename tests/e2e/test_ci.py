@@ -10,17 +10,12 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from threading import Lock
 from xml.etree import ElementTree as ET
 
 import pytest
 
 from icrtool.cli import main
-from icrtool.fleet.one_log import process
-from icrtool.records.fleet_document import FleetLog
-from icrtool.records.requests import decode_request
 
-ONE_AT_A_TIME = Lock()
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^ *icrtool ((?!cache warm|batch s3:).*)$", PAGE, re.MULTILINE)
 LIMIT = ("--baseline", "baseline", "--gate", "recommended.p95@5m <= 1.1 * baseline")
@@ -34,20 +29,12 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return int(left.value.code or 0)
 
 
-def in_this_process(request: bytes, timeout_s: float, stage: object = None) -> FleetLog:
-    """Process a log of a batch without a process of its own, which would load all libraries again."""
-    # Two threads must not be the first to use a module (`icrtool.cli.when_used`).
-    with ONE_AT_A_TIME:
-        return process(decode_request(request), lambda _: None)
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with logs, in which the commands of the page were run one after the other."""
     place = tmp_path_factory.mktemp("repository")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
-        patch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
         Path("logs").mkdir()
         for seed, name in enumerate(("field", "other")):
             log = f"logs/{name}.mcap"
@@ -91,7 +78,6 @@ def test_a_gate_beyond_the_interval_fails_and_says_where(place: Path, icrtool, m
 
 def test_what_is_not_in_the_baseline_is_reported_and_all_of_it_is_an_error(place: Path, icrtool, monkeypatch) -> None:
     monkeypatch.chdir(place)
-    monkeypatch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
     baseline = place / "alone"
     (baseline / "runs").mkdir(parents=True)
     document = json.loads((place / "baseline" / "fleet.json").read_bytes())

@@ -7,8 +7,10 @@ and with the files alone that the image would have.
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -86,7 +88,12 @@ def job(place: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Action, 
     [step] = STEP
     assert step["uses"] == "./icrtool/.github/actions/icrtool"
     ran = action(place, tmp_path_factory.mktemp("temp"), step["with"])
-    outputs = ran.run(place)
+    with pytest.MonkeyPatch.context() as patch:
+        if (uv := Path(sys.executable).with_name("uv")).exists():
+            tools = tmp_path_factory.mktemp("tools")
+            (tools / "uv").symlink_to(uv)
+            patch.setenv("PATH", f"{os.environ['PATH']}:{tools}")
+        outputs = ran.run(place)
     if "connection broken by" in "".join(ran.said):
         pytest.skip("pip cannot fetch packages here")
     return ran, outputs
@@ -201,6 +208,32 @@ def test_the_lines_for_a_shell_end_in_a_verdict(place: Path, activate: Path) -> 
     done = in_bash(lines, place, {})
     assert done.returncode == 0, done.stderr
     assert json.loads((place / "results" / "fleet.json").read_bytes())["logs"][0]["verdicts"][0]["passed"]
+
+
+PYTHON = """#!/bin/sh
+echo "$@" >>"$(dirname "$0")/../../asked"
+case "$*" in
+-c*) ;;
+*venv*) mkdir -p "$3/bin"; cp "$0" "$3/bin/python"; echo "VIRTUAL_ENV=$PWD/$3" >"$3/bin/activate" ;;
+esac
+"""
+
+
+@pytest.mark.parametrize("uv", ["", "#!/bin/sh\nexit 1\n"], ids=["without uv", "uv cannot"])
+def test_pip_installs_by_hash_what_uv_does_not(place: Path, tmp_path: Path, uv: str) -> None:
+    tools = tmp_path / "own" / "bin"
+    tools.mkdir(parents=True)
+    for name, text in {"python3": PYTHON, "icrtool": "#!/bin/sh\n", "uv": uv}.items():
+        if text:
+            (tools / name).write_text(text)
+            (tools / name).chmod(0o755)
+    script = f"PATH={tools}:/usr/bin:/bin {place}/icrtool/scripts/container-setup.sh made"
+    done = in_bash(script, tmp_path, {})
+    assert done.returncode == 0, done.stderr
+    asked = [line for line in (tmp_path / "asked").read_text().splitlines() if line.startswith("-m pip")]
+    pip = "-m pip --disable-pip-version-check install --quiet --no-compile --no-deps"
+    assert re.fullmatch(rf"{pip} --require-hashes -r \S+/pinned.txt", asked[0])
+    assert asked[1:] == [f"{pip} --no-build-isolation {place}/icrtool"]
 
 
 def test_the_image_is_made_by_the_script_alone_and_has_its_environment(activate: Path) -> None:

@@ -6,13 +6,15 @@ import os
 import re
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from random import Random
 
 import pytest
 
+from icrtool.cli import main
 from icrtool.pipeline import fit, report_into
 from icrtool.records.requests import ReportRequest, ResultFiles
 from support.barn import configured, simulate
@@ -241,14 +243,32 @@ def test_a_table_of_a_batch_that_is_a_link_is_replaced(
     assert not (run_place / "season" / name).is_symlink()
 
 
-@pytest.mark.parametrize("name", ["plots", ".rows", "runs", f"runs/{LOG.stem}"])
+@pytest.fixture(scope="module")
+def season(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a short log, and what a batch made of it."""
+    folder = tmp_path_factory.mktemp("season")
+    drive = ("--path", "curved", "--duration", "30", "--wheel-rate", "20", "--robot", "pentzer-tracked")
+    for arguments in (("simulate", "-o", folder / "short.mcap", *drive), ("batch", *BATCH, "-o", folder / "season")):
+        given = [str(folder / one) if one == "short.mcap" else str(one) for one in arguments]
+        with pytest.MonkeyPatch.context() as patch, suppress(SystemExit):
+            patch.setattr(sys, "argv", ["icrtool", *given, "-q"])
+            main()
+    assert (folder / "season" / "runs" / "short" / "run.json").is_file()
+    return folder
+
+
+BATCH = ("short.mcap", "-j", "1", "--robot", "pentzer-tracked", "--plots", "none", "--no-page")
+
+
+@pytest.mark.parametrize("name", ["plots", ".rows", "runs", "runs/short"])
 def test_a_folder_of_a_batch_that_is_a_link_is_refused(
-    icrtool: Command, home: Home, run_place: Path, name: str
+    icrtool: Command, home: Home, run_place: Path, season: Path, name: str
 ) -> None:
-    assert icrtool("batch", LOG, "-o", "season", "-q", "-j", "1", "--plots", "none")[0] == 0
+    shutil.copytree(season, run_place, dirs_exist_ok=True)
     assert home.run is not None
     linked(run_place / "season" / name, home.run if name.startswith("runs/") else home.folder / "folder")
-    status, _, errors = icrtool("batch", LOG, "-o", "season", "-j", "1", "--plots", "png", "--redo", "--overwrite")
+    plots = ("--plots", "png") if name == "plots" else ()
+    status, _, errors = icrtool("batch", *BATCH, "-o", "season", "--redo", "--overwrite", *plots)
     assert status == 1
     assert "a link, which is not followed" in errors
     assert home.is_untouched()

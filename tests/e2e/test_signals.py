@@ -49,9 +49,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for name in ("one.mcap", "two.mcap"):
         shutil.copy(LOG, folder / name)
     run = tmp_path_factory.mktemp("run") / "run"
-    subprocess.run(
-        [*ICRTOOL, "fit", str(LOG), *ROBOT, "-o", str(run), "--plots", "none", "-q"], check=True, timeout=120
-    )
+    icrtool.fit(icrtool.read_log(LOG, config := icrtool.load_config(robot=ROBOT[1])), config).write(run, plots=())
     return {"log": LOG, "folder": folder, "run": run}
 
 

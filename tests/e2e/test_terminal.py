@@ -10,13 +10,17 @@ import pty
 import re
 import shlex
 import struct
-import subprocess
 import sys
 import termios
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Thread
 
 import pytest
+
+from icrtool.cli import main
+from icrtool.fleet.processes import process_apart
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS, COLUMNS, MOST_LINES = 24, 80, 22
@@ -26,35 +30,70 @@ CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 Screen = Callable[..., tuple[int, list[str]]]
 
 
+@contextmanager
+def terminal(columns: int) -> Iterator[Callable[[], bytes]]:
+    """Give this process a terminal for its three streams; give what ends it and returns all that was written to it."""
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, columns, 0, 0))
+    shown: list[bytes] = []
+
+    def read() -> None:
+        # the terminal of a stream that was closed gives an error
+        with suppress(OSError):
+            while part := os.read(leader, 1 << 16):
+                shown.append(part)
+
+    reader = Thread(target=read)
+    kept, streams = [os.dup(one) for one in range(3)], (sys.stdin, sys.stdout, sys.stderr)
+    for one in range(3):
+        os.dup2(follower, one)
+    os.close(follower)
+    sys.stdin, sys.stdout, sys.stderr = (
+        open(one, mode, closefd=False)  # noqa: SIM115 - closed with the terminal
+        for one, mode in enumerate("rww")
+    )
+    reader.start()
+
+    def end() -> bytes:
+        if kept:
+            for one in (sys.stdout, sys.stderr):
+                one.flush()
+            sys.stdin, sys.stdout, sys.stderr = streams
+            for one in range(3):
+                os.dup2(kept[one], one)
+                os.close(kept[one])
+            kept.clear()
+            reader.join()
+            os.close(leader)
+        return b"".join(shown)
+
+    try:
+        yield end
+    finally:
+        end()
+
+
 @pytest.fixture
-def screen(tmp_path: Path) -> Screen:
+def screen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Screen:
     """Run a command in a terminal; give its status and the lines that stay on it, standard error among them."""
+    monkeypatch.chdir(tmp_path)
+    for name, value in {"TERM": "xterm", "COLUMNS": "", "LINES": ""}.items():
+        monkeypatch.setenv(name, value)
 
     def run(*arguments: object, columns: int = COLUMNS) -> tuple[int, list[str]]:
-        leader, follower = pty.openpty()
-        fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, columns, 0, 0))
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "", "LINES": ""}
-        command = [sys.executable, "-m", "icrtool", *map(str, arguments)]
-        process = subprocess.Popen(
-            command, cwd=tmp_path, env=environment, stdin=follower, stdout=follower, stderr=follower, close_fds=True
-        )
-        os.close(follower)
-        shown = b""
-        while True:
+        monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])
+        status = 0
+        with terminal(columns) as end:
             try:
-                part = os.read(leader, 1 << 16)
-            except OSError:  # the terminal of a process that ended
-                break
-            if not part:
-                break
-            shown += part
-        os.close(leader)
-        text = CONTROL.sub("", shown.decode())
+                main()
+            except SystemExit as left:
+                status = int(left.code or 0)
+            text = CONTROL.sub("", end().decode())
         # a line that is rewritten leaves its last state
         lines = [line.rstrip("\r").rpartition("\r")[2].rstrip() for line in text.split("\n")]
         while lines and not lines[-1]:
             lines.pop()
-        return process.wait(), lines
+        return status, lines
 
     return run
 
@@ -127,16 +166,14 @@ def test_without_a_track_width_no_slip_is_not_known(screen: Screen) -> None:
     assert re.search(r"no_slip not known needs --robot", text)
 
 
-def test_all_is_printed_on_request(screen: Screen) -> None:
-    log = ROOT / "sample_logs" / "wheeled_figure_eight"
-    brief, full = (screen("dropout-report", log, *ROBOT, "--plots", "none", *more)[1] for more in ((), ("-v",)))
+def test_all_is_printed_on_request_and_a_narrow_terminal_loses_no_column_without_notice(screen: Screen) -> None:
+    assert screen("simulate", "-o", "log.mcap", "--path", "curved", "--duration", "80", "-q", *ROBOT)[0] == 0
+    _, brief = screen("dropout-report", "log.mcap", *ROBOT, "--plots", "none", "--no-page")
     check_fits(brief)
+    full, lines = (
+        screen("dropout-report", "--plots", "none", "--no-page", "-v", columns=columns)[1] for columns in (COLUMNS, 60)
+    )
     assert len(full) > 2 * len(brief)
-
-
-def test_a_narrow_terminal_loses_no_column_without_notice(screen: Screen) -> None:
-    log = ROOT / "sample_logs" / "wheeled_figure_eight"
-    _, lines = screen("dropout-report", log, *ROBOT, "--plots", "none", "-v", columns=60)
     text = " ".join(" ".join(lines).split())
     assert "left out: the terminal has 60 columns" in text
     assert "…" not in "".join(line for line in lines if "%" in line)
@@ -192,7 +229,10 @@ def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Scree
     assert len(full) > len(brief) + 8
 
 
-def test_a_batch_has_a_line_a_log_and_says_which_one_is_cut_off(screen: Screen, tmp_path: Path) -> None:
+def test_a_batch_has_a_line_a_log_and_says_which_one_is_cut_off(
+    screen: Screen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("icrtool.fleet.batch.process_apart", process_apart)
     (tmp_path / "season").mkdir()
     content = (ROOT / "sample_logs" / "wheeled_lawnmower.mcap").read_bytes()
     (tmp_path / "season" / "whole.mcap").write_bytes(content)
