@@ -546,7 +546,7 @@ def test_an_interrupted_run_leaves_a_whole_directory_or_nothing(tmp_path, option
 def test_a_log_with_extreme_values_is_read_and_fitted_without_a_warning(
     tmp_path: Path, names: tuple[str, ...], value: float
 ) -> None:
-    usual = drive(60.0)
+    usual = drive(30.0)
     changed = {name: getattr(usual, name).copy() for name in names}
     for column in changed.values():
         column[5::14], column[12::14] = value, -value

@@ -34,7 +34,7 @@ LIDAR_JUMPS, CLEAN = (
 WITHIN_M = 2.5
 """At 10 m (95 %), of a robot whose wheels stand for its motion; two paths of 10 m cannot end more than 20 m apart."""
 
-MOST_STEPS = 2e7
+MOST_STEPS = 4e6
 """Steps of direct integration a model and log: above, every so many-th start is tried."""
 
 

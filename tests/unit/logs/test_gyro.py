@@ -57,9 +57,10 @@ def test_a_unit_that_measures_nothing_is_no_gyro_and_bad_samples_are_left_out() 
 
 
 @pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
-@pytest.mark.parametrize("slower", [1.0, 0.1])
-@pytest.mark.parametrize("has_heading", [True, False])
-@pytest.mark.parametrize("noise_radps", [0.0, 0.02])
+@pytest.mark.parametrize(
+    ("slower", "has_heading", "noise_radps"),
+    [(1.0, True, 0.0), (1.0, True, 0.02), (1.0, False, 0.0), (1.0, False, 0.02), (0.1, True, 0.0), (0.1, False, 0.02)],
+)
 def test_turn_rates_in_degrees_are_converted_and_named(
     tmp_path: Path, unit: float, slower: float, has_heading: bool, noise_radps: float
 ) -> None:

@@ -18,6 +18,7 @@ import time
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from threading import Event
 
@@ -41,13 +42,19 @@ DB3 = DIRECTORY / "wheeled_figure_eight.db3"
 CONFIG = load_config(robot="segway-rmp400")
 ROWS = range(100)
 PACKERS: dict[str, Callable[[bytes], bytes]] = {
-    ".gz": gzip.compress,
-    ".bz2": bz2.compress,
-    ".xz": lzma.compress,
+    ".gz": partial(gzip.compress, compresslevel=1),
+    ".bz2": partial(bz2.compress, compresslevel=1),
+    ".xz": partial(lzma.compress, preset=0),
     ".zst": zstandard.compress,
     ".lz4": lz4.frame.compress,
 }
 MODES = {".tar": "w", ".tar.gz": "w:gz", ".tar.bz2": "w:bz2", ".tar.xz": "w:xz", ".tgz": "w:gz"}
+
+
+def tar_file(path: Path, ending: str) -> tarfile.TarFile:
+    """Open a new tar archive, compressed as fast as its format can be."""
+    fast = {"": {}, "gz": {"compresslevel": 1}, "bz2": {"compresslevel": 1}, "xz": {"preset": 0}}
+    return tarfile.open(path, MODES[ending], **fast[MODES[ending].partition(":")[2]])
 
 
 @pytest.fixture(autouse=True)
@@ -88,7 +95,7 @@ def test_a_compressed_log_is_read_as_what_is_in_it(tmp_path, log, packing):
 @pytest.mark.parametrize("log", [MCAP, DIRECTORY], ids=["file", "directory"])
 def test_a_log_or_bag_directory_in_a_tar_archive_is_read(tmp_path, log, ending):
     path = tmp_path / f"x{ending}"
-    with tarfile.open(path, MODES[ending]) as archive:
+    with tar_file(path, ending) as archive:
         archive.add(log, f"season/2026/{log.name}")
         archive.add(SAMPLES / "README.md", "README.md")
     assert content(path) == content(log)
@@ -168,7 +175,7 @@ def test_a_damaged_file_gives_a_log_or_one_line(tmp_path, packing):
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("a.mcap", MCAP.read_bytes()[:60_000])
     else:
-        with tarfile.open(path, MODES[packing]) as archive:
+        with tar_file(path, packing) as archive:
             entry = tarfile.TarInfo("a.mcap")
             entry.size = 60_000
             archive.addfile(entry, io.BytesIO(MCAP.read_bytes()))
@@ -202,7 +209,7 @@ def zeros(count: int) -> io.BufferedReader:
 
 @pytest.mark.parametrize("packing", [*PACKERS, ".zip", ".tar.gz"])
 def test_a_bomb_is_unpacked_to_its_limit_only(tmp_path, temporary, monkeypatch, packing):
-    path, size = tmp_path / f"a.mcap{packing}", 200_000_000
+    path, size = tmp_path / f"a.mcap{packing}", 40_000_000
     if packing == ".zip":
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.mcap", "w") as entry:
             shutil.copyfileobj(zeros(size), entry)

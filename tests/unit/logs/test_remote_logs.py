@@ -34,6 +34,7 @@ from icrtool.logs.containers.source import find
 from icrtool.logs.read_log import read_log
 from icrtool.records.fleet_document import FleetFile
 from icrtool.records.places import UrlPath, place_of, without_secrets
+from support.batches import in_this_process
 from support.servers import SECRET, file_server, object_store
 
 SAMPLES = Path(__file__).parents[3] / "sample_logs"
@@ -374,9 +375,20 @@ def test_fit_from_an_address_gives_the_run_of_the_file_and_no_secret(tmp_path, m
     assert run(monkeypatch, capfd, "fit", MCAP, *ROBOT, "-o", "local", "--plots", "none")[0] == 0
     with file_server(SAMPLES, token=TOKEN) as server:
         url = f"{server.url}/{MCAP.name}?{TOKEN}"
+        given = (*ROBOT, "-o", "remote", "--plots", "none", "--no-ladder", "-v")
         for _ in range(2):  # a second time, its own run is replaced
             status, said = run(
-                monkeypatch, capfd, "dropout-report", url, *ROBOT, "-o", "remote", "--plots", "none", "-v"
+                monkeypatch,
+                capfd,
+                "dropout-report",
+                url,
+                *ROBOT,
+                "-o",
+                "remote",
+                "--plots",
+                "none",
+                "--no-ladder",
+                "-v",
             )
             assert status == 0, said
             assert SECRET not in said
@@ -394,6 +406,7 @@ def test_fit_from_an_address_gives_the_run_of_the_file_and_no_secret(tmp_path, m
 
 def test_batch_reads_a_bucket_and_skips_what_is_unchanged(fresh, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
     command = ("batch", "s3://field/mon", *ROBOT, "-o", "out", "--plots", "none", "--no-ladder", "-j", "1", "--json")
     status, said = run(monkeypatch, capfd, *command)
     assert status == 0, said
