@@ -377,19 +377,7 @@ def test_fit_from_an_address_gives_the_run_of_the_file_and_no_secret(tmp_path, m
         url = f"{server.url}/{MCAP.name}?{TOKEN}"
         given = (*ROBOT, "-o", "remote", "--plots", "none", "--no-ladder", "-v")
         for _ in range(2):  # a second time, its own run is replaced
-            status, said = run(
-                monkeypatch,
-                capfd,
-                "dropout-report",
-                url,
-                *ROBOT,
-                "-o",
-                "remote",
-                "--plots",
-                "none",
-                "--no-ladder",
-                "-v",
-            )
+            status, said = run(monkeypatch, capfd, "dropout-report", url, *given)
             assert status == 0, said
             assert SECRET not in said
         status, said = run(monkeypatch, capfd, "info", url, *ROBOT, "--json")
