@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Threads of OpenBLAS wait in a loop for the next matrix: an eighth to a fifth of the CPU time of the tests. NumPy reads this when
-# it is imported.
+# Threads of OpenBLAS wait in a loop for the next matrix: an eighth to a fifth of the CPU time of the tests. NumPy reads
+# this when it is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # How long an example takes depends on what else the machine does.
