@@ -197,15 +197,16 @@ def test_a_damaged_run_is_replaced_by_that_of_the_log_in_the_same_place_alone(wr
 
 def test_every_file_that_icrtool_writes_is_known_as_its_own(tmp_path: Path, run: Run) -> None:
     report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0, 10.0, 15.0, 20.0], outage_s=(4.0,), ladder=True)
-    for _ in range(2):
-        write_run(run, tmp_path / "run", plots=("png", "svg", "pdf"), figures="all")
-        for _ in range(2):
-            write_report(
-                lambda _: report, tmp_path / "run" / "dropout", plots=("png", "svg"), figures="all",
-                stamp_ns=run.table.stamp_ns[:0],
-            )  # fmt: skip
-        icrtool.write_page(run, report, tmp_path / "run" / "report.html")
-    assert len(names_in(tmp_path / "run")) > 30
+    write_run(run, tmp_path / "run", plots=("png", "svg", "pdf"), figures="all")
+    for plots in (("png", "svg"), ()):
+        write_report(
+            lambda _: report, tmp_path / "run" / "dropout", plots=plots, figures="all",
+            stamp_ns=run.table.stamp_ns[:0],
+        )  # fmt: skip
+        if plots:
+            assert len(names_in(tmp_path / "run")) > 30
+    icrtool.write_page(run, report, tmp_path / "run" / "report.html")
+    write_run(run, tmp_path / "run", plots=())
 
 
 @pytest.mark.parametrize("content", ["{}", "[1]", "not json", '{"schema": 3}', '{"schema": "other/1"}'])

@@ -19,6 +19,7 @@ from icrtool.cli import main
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.remote_place import on_disk
 from icrtool.records.places import UrlPath
+from support.batches import in_this_process
 from support.servers import SECRET, object_store
 
 SAMPLES = Path(__file__).parents[4] / "sample_logs"
@@ -195,15 +196,17 @@ def test_the_run_of_another_recording_is_not_replaced(store, monkeypatch, capfd)
 
 
 def test_a_batch_at_an_address_is_that_on_disk_and_is_continued(store, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
     (tmp_path / "season").mkdir()
     for log in (MCAP, BAG):
         shutil.copy(log, tmp_path / "season")
         store.client.upload_file(str(log), "field", f"season/{log.name}")
-    command = ("batch", "s3://field/season", *ROBOT, "-o", "s3://field/out", "--plots", "none", "-j", "1")
+    lean = ("--plots", "none", "--no-ladder", "-j", "1")
+    command = ("batch", "s3://field/season", *ROBOT, "-o", "s3://field/out", *lean)
     status, said = run(monkeypatch, capfd, *command)
     assert status == 0, said
     assert "fleet.csv" in said
-    assert run(monkeypatch, capfd, "batch", "season", *ROBOT, "-o", "out", "--plots", "none", "-j", "1")[0] == 0
+    assert run(monkeypatch, capfd, "batch", "season", *ROBOT, "-o", "out", *lean)[0] == 0
     written = {str(file.relative_to(tmp_path / "out")) for file in (tmp_path / "out").rglob("*") if file.is_file()}
     assert set(names(store, "out/")) == written
     tables = content(store, "out/fleet.csv"), (tmp_path / "out/fleet.csv").read_bytes()
