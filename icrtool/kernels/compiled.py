@@ -222,7 +222,7 @@ def _loaded(code: MachineCode | None, forms: Sequence[Any]) -> Callable[[Sequenc
     """Return what runs machine code; None where there is none, or llvmlite of this version cannot load it."""
     try:
         return code and code.function(forms)
-    except Exception:  # noqa: BLE001 - whatever llvmlite says: numba runs the kernel
+    except Exception:  # noqa: BLE001 - whatever the reason, numba runs the kernel
         return None
 
 
@@ -240,7 +240,7 @@ def machine_code(function: Callable[..., Any], values: Sequence[object], forms: 
     """
     try:
         return _machine_code(function, values, forms)
-    except Exception:  # noqa: BLE001 - a part of numba that is not public may fail in any way
+    except Exception:  # noqa: BLE001 - a part of numba that is not public may raise any error
         return None
 
 
@@ -306,7 +306,7 @@ def passes_as_expected() -> bool:
         return _gives_the_same(_fill, _Example(np.array([0.5, 3.0, 1.25]), True), 7, 0.75, None) and _gives_the_same(
             _clear
         )
-    except Exception:  # noqa: BLE001 - a part of numba that is not public may fail in any way
+    except Exception:  # noqa: BLE001 - a part of numba that is not public may raise any error
         return False
 
 
@@ -378,7 +378,7 @@ def _numba() -> ModuleType:
 
 
 def _mark_parts() -> None:
-    """Tell numba of the parts of kernels that were marked until now."""
+    """Register the parts of kernels that were marked until now."""
     options = _BARE if passes_as_expected() else _OPTIONS
     while _parts:
         _mark(_parts.pop(), options)
