@@ -245,6 +245,7 @@ def report_on(
         crossed = replace(compared, in_gap=whole.in_gap)
         cost = measure_errors(crossed, horizons, starts=request.starts, seed=request.seed)
     budgets_m = () if unusable else request.budgets_m
+    by_start = shown_paths.errors_by_start(compared, found, starts=request.starts)
     return _report(
         compared, errors, request,
         with_events=cost,
@@ -252,7 +253,8 @@ def report_on(
         left_out=why,
         calibrations=used,
         examples=examples,
-        worst=shown_paths.worst_trials(compared, found, starts=request.starts, further=of_topics),
+        worst=shown_paths.worst_trials(compared, found, further=of_topics, errors=by_start),
+        path_errors=by_start.on_path,
         outages=(*forced, *shown_paths.real_outages(compared)),
         budgets=with_other_grounds(
             [one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)], used
@@ -295,7 +297,7 @@ def _report(
     by_turning: tuple[TurningSplit, ...] = (), found: ComparedModels | None = None, left_out: str = "",
     worst: tuple[documents.ExampleTrial, ...] = (), examples: tuple[documents.ExampleTrial, ...] = (),
     outages: tuple[documents.Outage, ...] = (), baseline: report.BaselineReport | None = None, usable: bool = True,
-    notes: tuple[Note, ...] = (),
+    notes: tuple[Note, ...] = (), path_errors: documents.PathErrors | None = None,
 ) -> report.DropoutReport:  # fmt: skip
     """Return the report of a run.
 
@@ -359,7 +361,8 @@ def _report(
     return report.DropoutReport(
         **{field.name: getattr(errors, field.name) for field in fields(errors)}, document=document,
         run_directory=run.directory, reference_north_m=run.table.north_m, reference_east_m=run.table.east_m,
-        usable=usable, worst=worst, examples=examples, outages=outages, calibration=made, baseline=baseline,
+        usable=usable, worst=worst, examples=examples, outages=outages, path_errors=path_errors, calibration=made,
+        baseline=baseline,
     )  # fmt: skip
 
 

@@ -98,6 +98,7 @@ class DropoutReport(OpenLoopErrors):
     reference_north_m, reference_east_m : (n,) positions that trials are compared with, at every state
     usable : distances and numbers may be used, or the request accepts an unusable run
     worst, examples, outages : the same as in `document`, with their paths
+    path_errors : the error of every trial of the row of `worst`, by its start; None where there is no trial so long
     calibration : from this run alone, the model of row `recommended`; None where it was left out
     baseline : an earlier report that this report is compared with
     """
@@ -110,6 +111,7 @@ class DropoutReport(OpenLoopErrors):
     worst: tuple[documents.ExampleTrial, ...] = ()
     examples: tuple[documents.ExampleTrial, ...] = ()
     outages: tuple[documents.Outage, ...] = ()
+    path_errors: documents.PathErrors | None = None
     calibration: Calibration | None = None
     baseline: BaselineReport | None = None
 

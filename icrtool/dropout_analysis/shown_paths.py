@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,20 +12,23 @@ from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, m
 from icrtool.dropout_analysis.starts import counted_ends, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.run_filter import set_up_again
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import Bools, Floats, Rows
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.open_loop import open_loop_errors, open_loop_path
 from icrtool.kernels.track import OpenLoopPath, Track, trial_ends
 from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Trials
 from icrtool.records.choices import Starts
-from icrtool.records.dropout_document import ExampleTrial, Outage, OutageDocument, TrialDocument
+from icrtool.records.dropout_document import ExampleTrial, Outage, OutageDocument, PathErrors, TrialDocument
 from icrtool.records.plain_data import known
 from icrtool.records.rows import row_of
 from icrtool.records.run import Run, track_of
 
 WORST_COUNT = 10
 WORST_HORIZON_M = 10.0
+MOST_ON_PATH = 20_000
+"""Largest number of trials whose errors are kept by their start: a picture has some thousand places."""
+
 EXAMPLE_HORIZON_M = 15.0
 ALIKE_RAD = np.radians(10.0)
 STRAIGHT_SHARE, LONGEST_CHORD = 0.05, 1.1
@@ -44,35 +48,74 @@ FIXES_COMPARED_S = 1.0
 """Time after an outage whose fixes are compared with the open-loop path [s]. The path is driven on for this time."""
 
 
-def worst_trials(
-    run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT, *,
-    starts: Starts = "moving", further: Sequence[ComparedRow] = (),
-) -> tuple[ExampleTrial, ...]:  # fmt: skip
-    """Return the trials with the largest error that do not overlap, worst first.
+class StartErrors(NamedTuple):
+    """The end errors of the trials of one length, of the row `name`, and the states at which they end.
+
+    `error_m` (n,): by the state at which a trial starts, NaN where none does; `end` (n,)
+    """
+
+    name: str
+    horizon_m: float
+    error_m: Floats
+    end: Rows
+
+    @property
+    def on_path(self) -> PathErrors | None:
+        """The errors alone, of at most `MOST_ON_PATH` starts, the largest among them; None where there is no trial."""
+        start = np.flatnonzero(np.isfinite(self.error_m))
+        if not len(start):
+            return None
+        worst = start[np.argmax(self.error_m[start])]
+        start = np.union1d(start[:: -(-len(start) // MOST_ON_PATH)], [worst])
+        return PathErrors(self.name, self.horizon_m, start, self.error_m[start])
+
+
+def errors_by_start(
+    run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, *, starts: Starts = "moving"
+) -> StartErrors:
+    """Return the error of each trial of one length, of row ``recommended``, without it of the momentary ICRs.
 
     Parameters
     ----------
-    compared : held-out models; the trials are the worst of ``recommended``, without it of the momentary ICRs
-    further : further rows whose paths are shown
+    compared : held-out models
     """
-    track, models = track_of(run), models_of(run)
-    ends, rows = counted_ends(track, np.array([horizon_m]), starts), compared.rows if compared is not None else ()
+    track, icrs = track_of(run), models_of(run)[0]
+    ends = counted_ends(track, np.array([horizon_m]), starts)
+    rows = compared.rows if compared is not None else ()
     held_out = next((row for row in rows if row.name == RECOMMENDED), None)
     if compared is not None and held_out is not None:
         some = compared.table.trials[0].starts
         errors = np.full(len(ends), np.nan)
         errors[some] = held_out.errors_of(Trials(some, ends[some])).position[:, 0]
     else:
-        errors = open_loop_errors(track, models[0].icrs, ends)[:, 0]
-    ends, left = ends[:, 0], np.nan_to_num(errors, copy=False, nan=-1.0)
+        errors = open_loop_errors(track, icrs.icrs, ends)[:, 0]
+    return StartErrors(icrs.name if held_out is None else held_out.name, horizon_m, errors, ends[:, 0])
+
+
+def worst_trials(
+    run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT, *,
+    starts: Starts = "moving", further: Sequence[ComparedRow] = (), errors: StartErrors | None = None,
+) -> tuple[ExampleTrial, ...]:  # fmt: skip
+    """Return the trials with the largest error that do not overlap, worst first.
+
+    Parameters
+    ----------
+    compared, horizon_m, starts : as in `errors_by_start`
+    further : further rows whose paths are shown
+    errors : what `errors_by_start` returns, where it is known
+    """
+    found = errors_by_start(run, compared, horizon_m, starts=starts) if errors is None else errors
+    track, models, ends = track_of(run), models_of(run), found.end
+    left = np.nan_to_num(found.error_m, nan=-1.0)
     chosen: list[int] = []
     while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
         chosen.append(worst)
         before_its_end = slice(ends[worst] + 1)
         left[before_its_end][ends[before_its_end] >= worst] = -1.0
-    name = held_out.name if held_out is not None else models[0].name
-    rows = (*rows, *further)
-    return tuple(_example(run, track, models, rows, name, start, int(ends[start]), horizon_m) for start in chosen)
+    rows = (*(compared.rows if compared is not None else ()), *further)
+    return tuple(
+        _example(run, track, models, rows, found.name, start, int(ends[start]), found.horizon_m) for start in chosen
+    )
 
 
 def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[ExampleTrial, ...]:

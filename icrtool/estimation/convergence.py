@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, runs_of
-from icrtool.records.run import ICR_COLUMNS
+from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.run_document import IcrColumn
 from icrtool.records.tables import States
 
@@ -75,3 +75,34 @@ def fallen_at(std: Floats, share: float = LEARNED_SHARE) -> int | None:
     if final > (1.0 - LEAST_FALL) * first:
         return None
     return int(np.argmax(std <= final + (1.0 - share) * (first - final)))
+
+
+def icr_std_m(run: Run, column: IcrColumn) -> Floats:
+    """Return the standard deviation (n,) of an ICR [m] at each recorded state; it ends at ``final_std`` of run.json.
+
+    It is the filter's own (states.csv) where the drive does not show the ICR.
+
+    Notes
+    -----
+    The filter counts what it has learned with its process noise; ``final_std`` counts it by the differences between
+    stretches of the drive (`icrtool.estimation.observability.final_covariance`). With the filter's variance P(t), the
+    information that it has gained since the start is 1/P(t) - 1/P(0). One factor on it gives ``final_std`` at the end.
+    The start stays as configured, and the part of the clocks in x is added. Where the filter knows no more
+    at the end than at the start (a warm start), the difference of the variances, or their ratio, is applied instead.
+    """
+    own: Floats = np.asarray(getattr(run.table, f"std_{column}"), np.float64)
+    final = run.document.icr.final_std[column]
+    if final is None or not own[-1] > 0.0:
+        return own
+    clock = min(run.document.icr.x_clock_std_m, final) if column == "x_icr_m" else 0.0
+    variance, first, end = own**2, float(own[0]) ** 2, final**2 - clock**2
+    if 0.0 < end < first and variance[-1] < first:
+        gained = 1.0 / variance - 1.0 / first
+        factor = (1.0 / end - 1.0 / first) / gained[-1]
+        # Where the filter knows less than at the start (after a change of ground), its own variance holds.
+        counted = 1.0 / (1.0 / first + np.where(gained > 0.0, factor * gained, min(factor, 1.0) * gained))
+    elif end >= variance[-1]:
+        counted = variance + (end - variance[-1])
+    else:
+        counted = variance * (end / variance[-1])
+    return np.asarray(np.sqrt(counted + clock**2))

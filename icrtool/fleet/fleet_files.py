@@ -199,7 +199,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
             name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, {})[row.log] = error
     make_folders(folder / PLOTS, folder)
-    numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model)
+    numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model, {row.log: row.start_utc for row in rows})
     old = set(pictures_of_batch(folder))
     for name, figure in figures_of("fleet", numbers):
         for file in (folder / PLOTS / f"{name}.{form}" for form in picture_formats):

@@ -100,6 +100,11 @@ FIGURES = {
         "report", "The worst trials", "What they share (a turn, a slope, a place) is where the model fails.",
         "dropout_paths.dropout_worst", lambda report: ONCE if report.worst else {}, with_place=True,
     ),
+    "error_map": Entry(
+        "report", "Where the errors arise",
+        "Dark parts of the path: from there on the error is large. What do they share?",
+        "dropout_paths.dropout_map", lambda report: ONCE if report.path_errors is not None else {}, with_place=True,
+    ),
     "outages": Entry(
         "report", "Outages",
         "The path without GNSS, forced or real, and where the estimate was when fixes returned.",
@@ -131,8 +136,8 @@ FIGURES = {
         "calibrations.fleet_errors", lambda fleet: ONCE if fleet.errors_m else {},
     ),
     "transfer": Entry(
-        "comparison", "The cost of a foreign calibration",
-        "Left: the darker, the larger the error. Right: an interval (95 %) that crosses zero may be chance.",
+        "comparison", "Differences between the groups",
+        "Left: the errors of each group, by calibration. Right: an interval (95 %) that holds zero may be chance.",
         "calibrations.transfer",
     ),
 }  # fmt: skip

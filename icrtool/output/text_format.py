@@ -48,6 +48,16 @@ def position_word(summary: RunDocument) -> str:
     return "GNSS fixes" if summary.gnss.datum is not None else "position reference"
 
 
+def fix_word(summary: RunDocument) -> str:
+    """Return the word for what an outage lacks: ``GNSS``, or ``position`` for a reference that was metric already."""
+    return "GNSS" if summary.gnss.datum is not None else "position"
+
+
+def direction_words(summary: RunDocument | None) -> tuple[str, str]:
+    """Return the names of the axes across and up a map: ``East``, ``North``; of a frame without datum ``x``, ``y``."""
+    return ("East", "North") if summary is None or summary.gnss.datum is not None else ("x", "y")
+
+
 def role_word(summary: RunDocument, role: Role) -> str:
     """Return the word for a stream: a position reference that was metric already is not called GNSS."""
     return ROLE_WORDS[role] if summary.gnss.datum is None else role

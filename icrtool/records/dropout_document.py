@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from icrtool.config import Config
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.error_statistics import BlockSums, Histogram
 from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.acceptance import BudgetDistance, Verdict
@@ -373,6 +373,24 @@ class ExampleTrial:
     reference_north_m: Floats
     reference_east_m: Floats
     paths: dict[str, OpenLoopPath]
+
+
+@dataclass(frozen=True, slots=True)
+class PathErrors:
+    """Errors of one model's trials by the place where they start, for a picture.
+
+    Attributes
+    ----------
+    model : its name
+    horizon_m : length of the trials
+    start : states (k,) at which they start, increasing
+    error_m : (k,)
+    """
+
+    model: str
+    horizon_m: float
+    start: Ints
+    error_m: Floats
 
 
 class IntervalsDocument(Record, frozen=True):

@@ -97,7 +97,7 @@ REPORT_ROWS: dict[str, Row] = {
         ),
         Row(
             "adaptive", "motion model that adapts", f"other logs, and {PAST}, {INSTALLATION}",
-            "pink", shown=True, pictured=True, in_csv=True, on_robot=True,
+            "pink", "dotted", shown=True, pictured=True, in_csv=True, on_robot=True,
             turned_knows=f"other logs, and {PAST}, {INSTALLATION}",
         ),
         Row(

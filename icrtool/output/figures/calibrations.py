@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import compress, cycle
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,13 +12,15 @@ from matplotlib.patches import Circle
 
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.output.figures import style
+from icrtool.output.figures.sheet import Sheet, new_sheet, styled
 from icrtool.output.figures.trajectory import name_directions
 from icrtool.output.text_format import error_text, signed
 from icrtool.records.acceptance import CHOICE_HORIZON_M
-from icrtool.records.calibration_document import GroupComparison
+from icrtool.records.calibration_document import ErrorsAt, GroupComparison
 from icrtool.records.text import counted
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from icrtool.alignment.estimator import ResidualsByEstimate
@@ -30,10 +33,11 @@ FORECAST_KEY_COLUMNS = 4
 """Number of columns in the legend of a forecast."""
 
 
-@style.styled
+@styled
 def forecast_figure(
-    forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, gyro: Forecast | None = None
-) -> Figure:
+    forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, gyro: Forecast | None = None, *,
+    ax: Axes | None = None,
+) -> Figure | Axes:  # fmt: skip
     """Return the figure of a forecast, with a line for each budget and a line where measured errors end."""
     reached = within_budget(forecast.distance_m, forecast.p95_m, budgets_m[0]) if budgets_m else None
     answer = f"{error_text(forecast.p95_m[-1])} off (95 %) at the end of {forecast.distance_m[-1]:.0f} m"
@@ -45,8 +49,9 @@ def forecast_figure(
     entries = 2 * (1 if gyro is None else 2) + len(budgets_m) + 3
     keys_in = style.KEY_ROW_IN * max(-(-entries // FORECAST_KEY_COLUMNS) - 2, 0)
     height_in, margins_in = 4.2 + keys_in, (0.7, 0.25, 0.75, 0.95 + keys_in)
-    figure = style.new_figure(answer, subtitle, width_in=9.0, height_in=height_in, margins_in=margins_in, wspace=0.28)
-    grown, path = figure.subplots(1, 2)
+    layout = {"width_in": 9.0, "height_in": height_in, "wspace": 0.28}
+    sheet = new_sheet(answer, subtitle, ax, margins_in=margins_in, **layout)
+    grown, path = sheet.subplots(1, 2)[0]
     for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
         if one is not None:
             grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **style.ICR | dash)
@@ -68,8 +73,8 @@ def forecast_figure(
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
     name_directions(path)
-    style.add_legend(figure, ncols=FORECAST_KEY_COLUMNS)
-    return figure
+    sheet.legend(ncols=FORECAST_KEY_COLUMNS)
+    return sheet.finished()
 
 
 SHOWN_PERCENT = 97.0
@@ -86,8 +91,8 @@ AFTER_LOOK: style.Look = style.spot(style.ICR["color"], 2.8, "o", style.ICR["col
 }
 
 
-@style.styled
-def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
+@styled
+def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | None = None) -> Figure | Axes:
     """Return residuals of displacements and of heading changes over windows, before and after."""
     places, turns = (residuals.before, residuals.after), (residuals.turn_before, residuals.turn_after)
     off_m = [np.hypot(*part) for part in places]
@@ -96,8 +101,8 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     answer = f"Windows of the drive are off by {last:.3f} m calibrated, {first:.3f} m before"
     windows = f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals"
     margins_in = (0.75, 0.2, 0.7, 1.0)
-    figure = style.new_figure(answer, f"{name}: {windows}", height_in=4.2, margins_in=margins_in, wspace=0.32)
-    place, turn = figure.subplots(1, 2)
+    sheet = new_sheet(answer, f"{name}: {windows}", ax, height_in=4.2, margins_in=margins_in, wspace=0.32)
+    place, turn = sheet.subplots(1, 2)[0]
     for part, turned, look in zip(places, turns, (BEFORE_LOOK, AFTER_LOOK), strict=True):
         place.plot(part[1], part[0], **look)
         turn.plot(np.degrees(residuals.turn_rad), np.degrees(turned), **look)
@@ -108,56 +113,123 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
         axes.set_ylim(-reach, reach)
     place.set(xlim=place.get_ylim(), xlabel="Residual to the right [m]", ylabel="Residual ahead [m]")
     turn.set(xlabel="Heading change measured, clockwise [°]", ylabel="Residual of the heading change [°]")
-    style.add_legend(figure, markerscale=2.0)
-    return figure
+    sheet.legend(markerscale=2.0)
+    return sheet.finished()
 
 
-LONGEST_CELL_NAME = 14
+LONGEST_GROUP_NAME = 12
+MOST_DIFFERENCES = 24
+"""Largest number of differences that are drawn at all distances. Of more, those after `CHOICE_HORIZON_M` are drawn."""
+
+FOREST_ROW_IN, FOREST_GAP_IN = 0.25, 1.0
+"""Height of a row of a forest plot, and of the space between two [in]."""
+
+SURE_LOOK: style.Look = {"marker": "o", "markersize": 5.0, "color": style.ICR["color"], "linestyle": "none",
+                         "elinewidth": 1.8, "capsize": 2.5}  # fmt: skip
+CHANCE_LOOK: style.Look = SURE_LOOK | {"markerfacecolor": "white", "color": "0.35", "elinewidth": 1.2}
+ALONE_LOOK: style.Look = style.spot("white", 6.0, "X", "0.35")
+"""Looks of a difference that is shown, of one that may be chance, and of one without an interval."""
 
 
-@style.styled
-def transfer(found: GroupComparison) -> Figure:
-    """Return the figure: p95 after 10 m, calibrated on row and tested on column; costs with 95 % intervals."""
-    names, rows = list(found.groups), [one for one in found.costs if one.p95_m is not None]
-    errors = np.full((len(names), len(names)), np.nan)
-    for cell in found.transfer:
-        if cell.horizon_m == CHOICE_HORIZON_M and cell.p95_m is not None:
-            errors[names.index(cell.calibrated_on), names.index(cell.tested_on)] = cell.p95_m
-    with_own = np.eye(len(names), dtype=bool)
-    # The errors with a calibration of another group, and with its own.
-    parts = [part[np.isfinite(part)] for part in (errors[~with_own], errors[with_own])]
-    answer = f"No group has a trial of {CHOICE_HORIZON_M:g} m"
-    if all(map(len, parts)):
-        ends = [(error_text(min(part)).removesuffix(" m"), error_text(max(part)).removesuffix(" m")) for part in parts]
-        other, own = (" to ".join(dict.fromkeys(both)) for both in ends)
-        answer = f"{other} m off after {CHOICE_HORIZON_M:g} m (95 %) with another's calibration, {own} m with its own"
-    subtitle = f"{' · '.join(names)}: on the diagonal each trial is predicted by a fit that does not contain it"
-    height_in, margins_in = 2.95 + 0.45 * len(names) + 0.12 * len(rows), (1.3, 0.2, 1.35, 0.75)
-    figure = style.new_figure(answer, subtitle, width_in=9.6, height_in=height_in, margins_in=margins_in, wspace=1.15)
-    matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
-    most = float(np.nanmax(errors)) if np.isfinite(errors).any() else 1.0
-    matrix.imshow(errors, cmap="Blues", vmin=0.0, vmax=1.6 * most)
-    for (row, column), error in np.ndenumerate(errors):
-        text = f"{error:.2f} m" if np.isfinite(error) else "–"
-        matrix.text(column, row, text, ha="center", va="center", fontsize=8.5)
-    short = [style.drawable(name, LONGEST_CELL_NAME) for name in names]
-    matrix.xaxis.tick_top()
-    matrix.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="left")
-    matrix.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
-    matrix.set_xlabel(f"95 % error after {CHOICE_HORIZON_M:g} m:\ncalibrated on the row, tested on the column")
-    matrix.grid(visible=False)
-    labels = []
+class Difference(NamedTuple):
+    """A row of a forest plot: words, a number [m], and its 95 % interval [m], None where there is none."""
+
+    words: str
+    value_m: float
+    low_m: float | None
+    high_m: float | None
+
+
+@styled
+def transfer(found: GroupComparison, *, ax: Axes | None = None) -> Figure | Axes:
+    """Return the 95 % errors of each group by calibration, and the differences between groups, with 95 % intervals.
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
+    """
+    errors, rows = _errors_of_groups(found), _differences(found)
+    names = " · ".join(found.groups)
+    heights = [max(len(part), 2) for part in (errors, rows)]
+    height_in = 2.6 + FOREST_ROW_IN * sum(heights)
+    layout: style.Look = {
+        "height_in": height_in,
+        "margins_in": (2.5, 0.25, 0.85, 1.0),
+        "hspace": 1.05 / height_in * 2.0,
+    }
+    sheet = new_sheet(
+        _comparison_title(found), f"{names}: 95 % errors by wheels alone, with 95 % intervals", ax, **layout
+    )
+    own, more = sheet.subplots(2, 1, height_ratios=heights)[:, 0]
+    _draw_forest(own, errors)
+    own.set(xlabel="Error [m]", xlim=(0.0, None))
+    own.set_title(f"95 % error after {CHOICE_HORIZON_M:g} m", loc="left", pad=5.0)
+    _draw_forest(more, rows, about_zero=True)
+    more.set_xlabel("Difference of the 95 % error [m]")
+    more.set_title("Differences: right of 0 is a larger error", loc="left", pad=5.0)
+    sheet.legend(columnspacing=2.4)
+    return sheet.finished()
+
+
+def _group(name: str) -> str:
+    return style.drawable(name, LONGEST_GROUP_NAME)
+
+
+def _comparison_title(found: GroupComparison) -> str:
+    """Return the largest difference of two groups after `CHOICE_HORIZON_M`, and whether it may be chance."""
+    at = [(pair, one) for pair in found.pairs for one in pair.errors if one.horizon_m == CHOICE_HORIZON_M]
+    known = [(pair, one.p95_m, one) for pair, one in at if one.p95_m is not None]
+    if not known:
+        return f"No two groups have trials of {CHOICE_HORIZON_M:g} m to compare"
+    pair, value_m, one = max(known, key=lambda each: abs(each[1]))
+    at_m = f"at {CHOICE_HORIZON_M:g} m"
+    if one.p95_low_m is None or one.p95_high_m is None:
+        return f"{_group(pair.second)}: {signed(value_m, 2)} m against {_group(pair.first)} {at_m}, no interval"
+    interval = f"({signed(one.p95_low_m, 2)} to {signed(one.p95_high_m, 2)})"
+    if one.p95_low_m <= 0.0 <= one.p95_high_m:
+        return f"No difference shown {at_m}: {signed(value_m, 2)} m {interval}"
+    return f"{_group(pair.second)}: {signed(value_m, 2)} m against {_group(pair.first)} {at_m} {interval}"
+
+
+def _errors_of_groups(found: GroupComparison) -> list[Difference]:
+    """Return the errors after `CHOICE_HORIZON_M`, by group; its own calibration, which is held out, first."""
+    cells = [one for one in found.transfer if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None]
+    cells.sort(key=lambda one: (list(found.groups).index(one.tested_on), one.calibrated_on != one.tested_on))
+    rows = []
+    for one in cells:
+        by = "own calibration" if one.calibrated_on == one.tested_on else f"{_group(one.calibrated_on)}'s"
+        rows.append(Difference(f"{_group(one.tested_on)}, {by}", one.p95_m or 0.0, one.p95_low_m, one.p95_high_m))
+    return rows
+
+
+def _differences(found: GroupComparison) -> list[Difference]:
+    """Return differences between groups with their own calibrations, then the costs of foreign calibrations."""
+    rows: list[tuple[ErrorsAt, str]] = [
+        (one, f"{_group(pair.second)} − {_group(pair.first)}, {one.horizon_m:g} m")
+        for pair in found.pairs for one in pair.errors
+    ]  # fmt: skip
+    rows += [
+        (one, f"{_group(one.tested_on)}, {_group(one.calibrated_on)}'s − own, {one.horizon_m:g} m")
+        for one in found.costs
+    ]
+    if len(rows) > MOST_DIFFERENCES:
+        rows = [(one, words) for one, words in rows if one.horizon_m == CHOICE_HORIZON_M]
+    return [Difference(words, one.p95_m, one.p95_low_m, one.p95_high_m) for one, words in rows if one.p95_m is not None]
+
+
+def _draw_forest(axes: Axes, rows: Sequence[Difference], *, about_zero: bool = False) -> None:
+    """Draw numbers with their intervals, a row each; `about_zero`: an interval that holds zero may be chance."""
     for y, one in enumerate(rows):
-        calibrated, tested = (style.drawable(name, LONGEST_CELL_NAME) for name in (one.calibrated_on, one.tested_on))
-        labels.append(f"{calibrated} on {tested}, {one.horizon_m:g} m")
-        if one.p95_low_m is not None and one.p95_high_m is not None:
-            costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **style.ICR | {"linestyle": "-"})
-        costs.plot([one.p95_m], [y], "o", color=style.ICR["color"], markersize=4)
-    costs.axvline(0.0, **style.HALF_WIDTH)
-    costs.set_yticks(range(len(rows)), labels, fontsize=7.5, parse_math=False)
-    costs.invert_yaxis()
-    costs.set_xlabel("95 % error more than with its own calibration [m]")
-    return figure
+        if one.low_m is None or one.high_m is None:
+            axes.plot([one.value_m], [y], label="no interval: too little path", **ALONE_LOOK)
+            continue
+        chance = about_zero and one.low_m <= 0.0 <= one.high_m
+        look, label = (CHANCE_LOOK, "may be chance: holds 0") if chance else (SURE_LOOK, "with 95 % interval")
+        reach = [[max(one.value_m - one.low_m, 0.0)], [max(one.high_m - one.value_m, 0.0)]]
+        axes.errorbar([one.value_m], [y], xerr=reach, label=label, **look)
+    if about_zero:
+        axes.axvline(0.0, **style.HALF_WIDTH)
+    axes.set_yticks(range(len(rows)), [one.words for one in rows], parse_math=False)
+    axes.set_ylim(max(len(rows), 1) - 0.4, -0.6)
+    axes.grid(visible=False, axis="y")
 
 
 ROW_IN = 0.22
@@ -165,7 +237,7 @@ MOST_CALENDAR_ROWS = 40
 LEAST_DAYS = 1.0
 """Shortest span of a date axis [days]. matplotlib would show four years for a single date."""
 
-LONGEST_ROBOT, LONGEST_GROUP, LONGEST_LOG = 24, 24, 34
+LONGEST_ROBOT, LONGEST_GROUP, LONGEST_LOG = 24, 24, 26
 """Largest number of characters in the label of a robot, a group and a log."""
 
 GROUP_LOOKS: tuple[style.Look, ...] = tuple(
@@ -183,33 +255,77 @@ class FleetNumbers(NamedTuple):
     points : the logs with a date and both lateral ICRs
     errors_m : 95 % error after 10 m of each log, by group and name
     model : the model of these errors
+    starts_utc : begin of each log by its name, where it is known
     """
 
     title: str
     points: Sequence[FleetLog]
     errors_m: Mapping[str, Mapping[str, float]]
     model: str
+    starts_utc: Mapping[str, str] = MappingProxyType({})
 
 
-@style.styled
-def fleet_icrs(fleet: FleetNumbers) -> Figure:
-    """Return both lateral ICRs of every log over its date, ±σ, a colour and marker per robot."""
+def _dated(log: str, start_utc: str) -> str:
+    """Return the label of a log: its name, and its date where it is known."""
+    return f"{style.drawable(log, LONGEST_LOG)}   {start_utc[:10]}".rstrip()
+
+
+@styled
+def fleet_icrs(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
+    """Return both lateral ICRs of every log, ±σ, a colour and marker per robot.
+
+    Up to `MOST_CALENDAR_ROWS` logs have a row each with name and date, in the order of the dates; more are drawn over
+    their dates. `ax`: axes to draw into, which are returned; by default the picture is a new figure.
+    """
+    points = fleet.points
+    spans = []
+    for side in ("right", "left"):
+        found = [point.icr[f"y_icr_{side}_m"] or 0.0 for point in points]
+        spans.append(f"y {side} {signed(min(found), 2)} to {signed(max(found), 2)} m")
+    title, subtitle = f"ICRs: {', '.join(spans)}", f"{fleet.title}: of each log, ±1σ"
+    if len(points) > MOST_CALENDAR_ROWS:
+        sheet = new_sheet(title, subtitle, ax, height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12)
+        _draw_over_dates(sheet, points)
+    else:
+        height_in = 1.85 + ROW_IN * len(points)
+        sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=(3.1, 0.25, 0.65, 1.0), wspace=0.12)
+        left, right = panels = sheet.subplots(1, 2, sharey=True)[0]
+        ordered = sorted(points, key=lambda point: (point.robot, point.start_utc))
+        for axes, side in zip(panels, ("left", "right"), strict=True):
+            for robot, look in zip(dict.fromkeys(point.robot for point in ordered), cycle(GROUP_LOOKS), strict=False):
+                rows = [row for row, point in enumerate(ordered) if point.robot == robot]
+                icrs, stds = (
+                    [ordered[row].icr.get(f"{part}y_icr_{side}_m") or 0.0 for row in rows] for part in ("", "std_")
+                )
+                axes.errorbar(icrs, rows, xerr=stds, markersize=5.0, capsize=2.0, label=_key_of(robot), **look)
+            axes.set_xlabel(f"ICR y {side} [m]")
+            axes.locator_params(axis="x", nbins=4)
+        left.set_yticks(range(len(ordered)), [_dated(one.log, one.start_utc) for one in ordered], parse_math=False)
+        right.tick_params(labelleft=False)
+        left.set_ylim(len(ordered) - 0.4, -0.6)
+    sheet.legend(ncols=4)
+    return sheet.finished()
+
+
+def _key_of(robot: str) -> str:
+    """Return the name of a robot in a legend; matplotlib leaves out a name that begins with an underscore."""
+    return f" {style.drawable(robot or 'robot not named', LONGEST_ROBOT)}"
+
+
+def _draw_over_dates(sheet: Sheet, points: Sequence[FleetLog]) -> None:
+    """Draw both lateral ICRs of many logs over their dates."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
-    points, robots = fleet.points, dict.fromkeys(point.robot for point in fleet.points)
+    robots = dict.fromkeys(point.robot for point in points)
     icrs = {side: [point.icr[f"y_icr_{side}_m"] or 0.0 for point in points] for side in ("right", "left")}
-    spans = (f"y {side} {signed(min(found), 2)} to {signed(max(found), 2)} m" for side, found in icrs.items())
-    title, subtitle = f"ICRs: {', '.join(spans)}", f"{fleet.title}: of each log, ±σ"
-    figure = style.new_figure(title, subtitle, height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12)
-    panels = figure.subplots(2, 1, sharex=True)
+    panels = sheet.subplots(2, 1, sharex=True)[:, 0]
     days = date2num([np.datetime64(point.start_utc.rstrip("Z")) for point in points])  # type: ignore[no-untyped-call]
     for axes, (side, found) in zip(panels, icrs.items(), strict=True):
         stds = [point.icr.get(f"std_y_icr_{side}_m") or 0.0 for point in points]
         for robot, look in zip(robots, cycle(GROUP_LOOKS), strict=False):
-            key = f" {style.drawable(robot or 'robot not named', LONGEST_ROBOT)}"  # matplotlib leaves out "_label"
             mine = [point.robot == robot for point in points]
             columns = (list(compress(column, mine)) for column in (days, found, stds))
-            axes.errorbar(*columns, markersize=4.5, capsize=2.0, linewidth=1.0, label=key, **look)
+            axes.errorbar(*columns, markersize=4.5, capsize=2.0, linewidth=1.0, label=_key_of(robot), **look)
         axes.set_ylabel(f"ICR y {side} [m]")
     first, last = panels[-1].get_xlim()
     if last - first < LEAST_DAYS or len(set(days)) == 1:
@@ -220,13 +336,14 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
     years = sorted({point.start_utc[:4] for point in points})
     panels[-1].set_xlabel(f"Date, UTC, {' to '.join(dict.fromkeys((years[0], years[-1])))}")
-    style.add_legend(figure, ncols=4)
-    return figure
 
 
-@style.styled
-def fleet_errors(fleet: FleetNumbers) -> Figure:
-    """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs the largest errors."""
+@styled
+def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
+    """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs the largest errors.
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
+    """
     errors = [
         (group, log, error)
         for group, logs in fleet.errors_m.items()
@@ -236,12 +353,12 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
     shown = [one for one in errors if one in largest]
     cut = f", the {MOST_CALENDAR_ROWS} largest" if len(errors) > MOST_CALENDAR_ROWS else ""
     median = error_text(float(np.median([error for *_, error in errors])))
-    labels = [style.drawable(log, LONGEST_LOG) for _, log, _ in shown]
+    labels = [_dated(log, fleet.starts_utc.get(log, "")) for _, log, _ in shown]
     title = f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}"
     subtitle = f"{fleet.title}: 95 % error after 10 m without GNSS, {fleet.model}{cut}"
-    height_in = 1.9 + ROW_IN * len(shown)
-    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=(2.9, 0.7, 0.65, 1.05))
-    axes = figure.subplots()
+    height_in = 1.85 + ROW_IN * len(shown)
+    sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=(3.1, 0.7, 0.65, 1.0))
+    axes = sheet.subplots()[0, 0]
     axes.set_yticks(range(len(labels)), labels, parse_math=False)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     for (group, logs), look in zip(fleet.errors_m.items(), cycle(GROUP_LOOKS), strict=False):
@@ -249,9 +366,9 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
         middle = error_text(float(np.median(list(logs.values()))))
         label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
         axes.plot([shown[row][2] for row in rows], rows, markersize=5.5, label=label, **look)
-    centred: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False, "bbox": None}
+    centred: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False}
     for row, (*_, error) in enumerate(shown):
         style.write_near(axes, error_text(error), (error, row), (6.0, 0.0), **centred)
     style.logarithmic_errors(axes)
-    style.add_legend(figure, ncols=2)
-    return figure
+    sheet.legend(ncols=2)
+    return sheet.finished()

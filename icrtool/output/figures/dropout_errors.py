@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,11 +12,12 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
-from icrtool.output.text_format import error_text, run_title
+from icrtool.output.figures.labels import Label, write_labels
+from icrtool.output.figures.sheet import new_sheet, styled
+from icrtool.output.text_format import error_text, fix_word, run_title
 from icrtool.records.acceptance import BudgetDistance
 from icrtool.records.dropout_document import ModelResult, column_of
-from icrtool.records.rows import LONGEST_ROW_NAME, row_of, rows_of, shown_rows
-from icrtool.records.text import shortened
+from icrtool.records.rows import row_of, rows_of, shown_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,16 +29,33 @@ P95 = style.line("black", width=1.2)
 """Line of the 95 % mark: solid in every picture; the expected value is dashed (`MEAN`)."""
 
 THIN = 0.9
-BAND_ALPHA = 0.18
-CURVE_POINTS = 200
+
+BANDS = (("", 0.32, "its 95 % interval", 1.4), ("next_", 0.13, "next drive, 9 of 10", 1.3))
+"""Bands of the first row: part of the names of their ends, opacity, label, order."""
+
+BAND_TOPS = ("p95_high_m", "p95_next_high_m")
+
+MOST_BAND = 3.0
+"""Largest ratio of the end of the scale to the largest line. A wider band is cut off."""
+
+BAR_HORIZONS_M = (5.0, 10.0, 15.0, 20.0)
+"""Distances at which rows other than the first have a bar for their interval [m]."""
+
+BAR_LOOK: style.Look = {"linestyle": "none", "elinewidth": 1.1, "capsize": 2.0, "zorder": 2.3}
+BAR_STEP = 0.009
+"""Distance of these bars from one row to the next, as a share of the axis."""
+
+TITLE_CHARACTERS = int(style.TITLE_CHARACTERS_PER_INCH * style.WIDTH_IN)
+
+END_LINE = style.line("0.45", (0, (1.0, 2.0)), 1.0)
+UNIT_SPACE = re.compile(r"(\d) m\b")
+END_CHARACTERS = 30
+"""Characters in a line of the text where lines and bands end."""
 
 LEAST_SHOWN = 0.7
 """Ratio of the lower end of the scale to the smallest drawn error, and of the largest drawn error to the upper end."""
 
 MOST_DECADES = 4.0
-LABEL_PT, LABEL_LINE_PT = 5.0, 13.0
-SPACE_OF_LABEL = 0.09
-"""Width of a distance's label, as a share of the axis. The label is left of its mark where it fits there."""
 
 LEAST_HISTOGRAM_IN_P95 = 1.3
 """Ratio of the end of the histograms' common scale to the largest p95 of the models."""
@@ -50,62 +70,118 @@ SUMMARY_KEY_COLUMNS = 3
 MOSTLY_BEYOND_PCT = 90.0
 
 
-@style.styled
-def dropout_summary(report: DropoutReport) -> Figure:
-    """Return 95 % and expected error [m] over distance without GNSS [m]: how far each model stays within the budget.
+@styled
+def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
+    """Return 95 % and expected error [m] over distance without fixes [m]: how far each model stays within the budget.
 
-    It shows the rows that are shown and pictured; rows for comparison are thin lines.
+    It shows the rows that are shown and pictured; rows for comparison are thin lines. The first row has bands: its
+    interval on this drive, and where its error on the next drive lies. The others have bars at some distances, so that
+    no two bands overlap. `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
     models = [*_models(report), *(one for one in _pictured(report) if row_of(one.name).compared)]
+    first, horizons_m = models[0], report.horizons_m
     budgets_m = list(dict.fromkeys(one.budget_m for one in report.document.budgets))
     reached = [one for one in report.document.budgets if one.model in {model.name for model in models}]
-    best = next((one for one in reached if one.model == models[0].name), None)
-    pens = _pens(report)
-    title = "Error over distance: no trial was long enough"
-    if best is not None:
-        title = f"{shortened(best.model, LONGEST_ROW_NAME)}: within {best.budget_m:g} m (95 %) for {best.short_text}"
-    elif known := [row for row in models[0].document.by_horizon if row.p95_m is not None]:
-        # For a run that is not usable no distance is stated.
-        refused = "" if report.usable else "Do not use: "
-        title = f"{refused}{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
-    # Entries in addition to the models: the mean of the first model, budget, outages.
-    most = max(row.trials for row in report.document.trials)
-    keys_in = style.KEY_ROW_IN * max(-(-(len(models) + 3) // SUMMARY_KEY_COLUMNS) - 2, 0)
-    subtitle = f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals"
-    margins_in = (0.75, 0.25, 0.65, 0.95 + keys_in)
-    figure = style.new_figure(title, subtitle, height_in=4.6 + keys_in, margins_in=margins_in)
-    axes = figure.subplots()
-    # A line begins where trials do, or where its model has used up the budget.
-    first_m = min([report.horizons_m[0], *(one.distance_m for one in reached if not row_of(one.model).compared)])
+    pens, known = _pens(report), [row for row in first.document.by_horizon if row.p95_m is not None]
+    ends = [known[row] for row in ((0, -1) if len(known) > 1 else (0,) if known else ())]
+    trials = ", ".join(f"{row.trials:,} trials of {row.horizon_m:g} m" for row in ends)
+    # Both errors and bands of the first model, the other models and their bars, budget, outages.
+    keys_in = style.KEY_ROW_IN * max(-(-(len(models) + 6) // SUMMARY_KEY_COLUMNS) - 2, 0)
+    sheet = new_sheet(
+        _summary_title(report, first), f"{run_title(report.run_document)}: {first.name}, {trials or 'no trials'}", ax,
+        height_in=4.7 + keys_in, margins_in=(0.75, 0.25, 0.65, 1.05 + keys_in),
+    )  # fmt: skip
+    axes = sheet.subplots()[0, 0]
+    curves: list[tuple[Floats, Floats]] = []
+    bars = [one for one in models[1:] if not row_of(one.name).compared]
     for one in models:
-        _draw_model(axes, one, report.horizons_m, first_m, pens[one.name], first=one is models[0])
-    outages = [one for one in report.document.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
+        crossings = [
+            (found.distance_m, found.budget_m) for found in reached if found.model == one.name and not found.beyond
+        ]
+        # A line begins where trials do, or where its model has used up the budget.
+        if row_of(one.name).compared:
+            crossings = [found for found in crossings if found[0] >= horizons_m[0]]
+        curves.append(_draw_model(axes, one, horizons_m, crossings, pens[one.name], first=one is first))
+        if one in bars:
+            shift_m = BAR_STEP * float(horizons_m[-1]) * (bars.index(one) + 1) * (-1) ** bars.index(one)
+            curves += _draw_bars(axes, one, horizons_m, shift_m, pens[one.name])
+    outages = [one for one in report.document.outages if one.kind == "real" and one.distance_m <= horizons_m[-1]]
+    if bars:
+        axes.errorbar([], [], [], label="other 95 % intervals", **BAR_LOOK | {"color": "0.35"})
     if outages:
         look = style.spot("black", 7.0, "X") | {"zorder": 5, "label": "real outage"}
         axes.plot(column_of(outages, "distance_m"), column_of(outages, "end_error_m"), **look)
-    # The scale holds all errors from the first horizon on, over at most `MOST_DECADES`.
-    drawn = [*(one.column("p95_m") for one in models), models[0].column("expected_error_m")]
+    # The scale holds all errors from the first horizon on, over at most `MOST_DECADES`, and the band where it is near.
+    drawn = [*(one.column("p95_m") for one in models), first.column("expected_error_m")]
     errors = np.concatenate([*drawn, budgets_m, column_of(outages, "end_error_m")])
     errors = errors[np.isfinite(errors) & (errors > 0)]
     low, high = 0.01, 1.0
     if len(errors):
-        high = float(errors.max()) / LEAST_SHOWN
+        highest = [float(errors.max()), *(float(np.nanmax(first.column(name), initial=0.0)) for name in BAND_TOPS)]
+        high = min(max(highest), MOST_BAND * highest[0]) / LEAST_SHOWN
         low = max(LEAST_SHOWN * float(errors.min()), high / 10**MOST_DECADES)
-    axes.set(xlim=(0, report.horizons_m[-1] * 1.02), ylim=(low, high), xlabel="Distance without GNSS [m]")
+    word = fix_word(report.run_document)
+    axes.set(xlim=(0, horizons_m[-1] * 1.02), ylim=(low, high), xlabel=f"Distance without {word} [m]")
     axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
     style.logarithmic_errors(axes, "y")
     label = f"budget {' and '.join(f'{one:g}' for one in budgets_m)} m"
+    marked = []
     for budget in budgets_m:
         axes.axhline(budget, label=label, **style.BUDGET)
-        marked = [one for one in reached if one.budget_m == budget and not (one.beyond or row_of(one.model).compared)]
-        _mark_reaches(axes, marked, pens, low)
-    style.add_legend(figure, ncols=SUMMARY_KEY_COLUMNS)
-    return figure
+        marked += [one for one in reached if one.budget_m == budget and not (one.beyond or row_of(one.model).compared)]
+    _write_end(axes, report, first)
+    _mark_reaches(axes, marked, pens, low, curves)
+    sheet.legend(ncols=SUMMARY_KEY_COLUMNS)
+    return sheet.finished()
 
 
-@style.styled
-def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
-    """Return the percent of the trials by error [m] of the first row, a panel a horizon, and the budget."""
+def _summary_title(report: DropoutReport, first: ModelResult) -> str:
+    """Return how far the first row stays within its budget, on this drive and on the next; else its last error."""
+    best = next((one for one in report.document.budgets if one.model == first.name), None)
+    if best is not None:
+        # One question, two answers: where the next drive has the same, one is enough.
+        after = f"; next drive {best.next_text}" if best.next_text and best.next_text != best.short_text else ""
+        answer = f"within {best.budget_m:g} m (95 %) for {best.short_text}{after}"
+        named = f"{first.name}: {answer}"
+        # The subtitle names the row, too.
+        return named if len(named) <= TITLE_CHARACTERS else f"W{answer[1:]}"
+    known = [row for row in first.document.by_horizon if row.p95_m is not None]
+    if not known:
+        return "Error over distance: no trial was long enough"
+    # For a run that is not usable no distance is stated.
+    refused = "" if report.usable else "Do not use: "
+    return f"{refused}{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
+
+
+def _write_end(axes: Axes, report: DropoutReport, first: ModelResult) -> None:
+    """Write why lines and bands end before the last horizon, where they do."""
+    finite = [np.flatnonzero(np.isfinite(first.column(name))) for name in ("p95_m", "p95_high_m")]
+    last, last_band = (int(rows[-1]) if len(rows) else -1 for rows in finite)
+    horizons_m, texts = report.horizons_m, []
+    if 0 <= last_band < last:
+        texts.append(
+            (last_band, f"bands end at {horizons_m[last_band]:g} m: too little path behind it for an interval")
+        )
+    if 0 <= last < len(horizons_m) - 1:
+        why = report.document.trials[last + 1].why_none or "none of this row"
+        texts.append((last, f"no trials beyond {horizons_m[last]:g} m: {why.partition(' (')[0]}"))
+    for row, text in texts:
+        at, left = float(horizons_m[row]), float(horizons_m[row]) > 0.5 * float(horizons_m[-1])
+        axes.axvline(at, **END_LINE)
+        wrapped = textwrap.fill(UNIT_SPACE.sub("\\1\N{NO-BREAK SPACE}m", text), END_CHARACTERS)
+        look: style.Look = {"ha": "right" if left else "left", "va": "bottom", "fontsize": 8.0, "color": "0.25"}
+        axes.annotate(
+            wrapped, (at, 0.0), (-4.0 if left else 4.0, 5.0), textcoords="offset points", zorder=6,
+            xycoords=axes.get_xaxis_transform(), **look,
+        )  # fmt: skip
+
+
+@styled
+def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | None = None) -> Figure | Axes:
+    """Return the percent of the trials by error [m] of the first row, a panel a horizon, and the budget.
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
+    """
     asked = [_place(report, metres) for metres in horizons_m]
     of_models = (
         (one, [h for h in asked if len(one.histograms[h].left)]) for one in (*_models(report), *report.results)
@@ -117,8 +193,8 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
     title = f"95 % of the trials end within {errors} m after {distances} m"
     subtitle = f"{run_title(report.run_document)}: open-loop error of {model.name} ({model.document.words})"
     height_in, margins_in = 1.55 + LOW_PANEL_IN * len(places), (0.75, 0.25, 0.85, 0.9)
-    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.38)
-    panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
+    sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=margins_in, hspace=0.38)
+    panels = sheet.subplots(len(places), 1, sharex=True)[:, 0]
     p95 = model.column("p95_m")[places]
     end = LEAST_HISTOGRAM_IN_P95 * max([np.nanmax(p95), *(one for one in budgets_m if one < 2 * np.nanmax(p95))])
     for axes, h in zip(panels, places, strict=True):
@@ -127,13 +203,15 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
         for budget in budgets_m:
             axes.axvline(budget, label=f"budget {budget:g} m", **style.BUDGET)
     panels[-1].set_xlabel("Error [m]")
-    style.add_legend(figure, columnspacing=3.0)
-    return figure
+    sheet.legend(columnspacing=3.0)
+    return sheet.finished()
 
 
-@style.styled
-def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
+@styled
+def dropout_histogram(report: DropoutReport, horizon_m: float, *, ax: Axes | None = None) -> Figure | Axes:
     """Return the percent of the trials by error [m] at one of the report's horizons [m], a panel a model.
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
     Raises
     ------
@@ -148,14 +226,14 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     title = f"After {horizon_m:g} m 95 % of the trials end within {least.removesuffix(' m')} to {most}, by model"
     subtitle = f"{run_title(report.run_document)}: open-loop error of {report.document.trials[h].trials:,} trials"
     height_in, margins_in = 1.5 + PANEL_HEIGHT_IN * len(results), (0.75, 0.2, 0.85, 0.9)
-    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.45)
-    panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
+    sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=margins_in, hspace=0.45)
+    panels = sheet.subplots(len(results), 1)[:, 0]
     end = min(LEAST_HISTOGRAM_IN_P95 * max(p95), MOST_HISTOGRAM_IN_P95 * p95[0])
     for axes, result in zip(panels, results, strict=True):
         _draw_bins(axes, result, h, _pens(report)[result.name]["color"], end, result.name)
     panels[-1].set_xlabel("Error [m]")
-    style.add_legend(figure, columnspacing=3.0)
-    return figure
+    sheet.legend(columnspacing=3.0)
+    return sheet.finished()
 
 
 def _pictured(report: DropoutReport) -> list[ModelResult]:
@@ -183,44 +261,61 @@ def _place(report: DropoutReport, horizon_m: float) -> int:
 
 
 def _draw_model(
-    axes: Axes, result: ModelResult, horizons_m: Floats, first_m: float, pen: style.Look, *, first: bool
-) -> None:  # fmt: skip
-    """Draw the 95 % error of a model with its interval; for the `first` model also the expected error.
+    axes: Axes, result: ModelResult, horizons_m: Floats, crossings: Sequence[tuple[float, float]], pen: style.Look, *,
+    first: bool,
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Draw the 95 % error of a model, of the `first` one also bands and the expected error; return the line (x, y).
 
-    A row for comparison has no interval. Lines interpolate between horizons like `budget_distances`, from error 0 at
-    distance 0.
+    Lines are straight between horizons, and pass the places (distance, budget) where the model reaches a budget.
     """
-    x = np.linspace(first_m, horizons_m[-1], CURVE_POINTS)
-    known = np.isfinite(result.column("p95_m"))
-    at = np.append(0.0, horizons_m[known])
-    p95, low, high, mean = (
-        np.where(x <= at[-1], np.interp(x, at, np.append(0.0, result.column(name)[known])), np.nan)
-        for name in ("p95_m", "p95_low_m", "p95_high_m", "expected_error_m")
-    )
+    p95 = result.column("p95_m")
+    known = np.isfinite(p95)
+    x = np.append(horizons_m[known], [distance_m for distance_m, _ in crossings])
+    y = np.append(p95[known], [budget_m for _, budget_m in crossings])
+    order = np.argsort(x, kind="stable")
     look = pen | {"zorder": 2.6 if first else 2.4}
-    axes.plot(x, p95, label=f"{result.name}, 95 %", **look)
-    if not row_of(result.name).compared:
-        axes.fill_between(x, low, high, color=pen["color"], alpha=BAND_ALPHA, linewidth=0)
+    axes.plot(x[order], y[order], label=f"{result.name}, 95 %", **look)
     if first:
-        axes.plot(x, mean, label=f"{result.name}, mean", **look | {"linewidth": THIN})
+        axes.plot(
+            horizons_m, result.column("expected_error_m"), label=f"{result.name}, mean", **look | {"linewidth": THIN}
+        )
+        for name, alpha, label, order_z in BANDS:
+            low, high = (result.column(f"p95_{name}{end}_m") for end in ("low", "high"))
+            if np.isfinite(low + high).any():
+                band: style.Look = {"color": pen["color"], "alpha": alpha, "linewidth": 0, "zorder": order_z}
+                axes.fill_between(horizons_m, low, high, label=label, **band)
+    return x[order], y[order]
+
+
+def _draw_bars(
+    axes: Axes, result: ModelResult, horizons_m: Floats, shift_m: float, pen: style.Look
+) -> list[tuple[Floats, Floats]]:  # fmt: skip
+    """Draw the interval of a model's 95 % error as bars near the distances of `BAR_HORIZONS_M`; return them (x, y)."""
+    rows = np.flatnonzero(np.isin(horizons_m, BAR_HORIZONS_M))
+    p95, low, high = (result.column(name)[rows] for name in ("p95_m", "p95_low_m", "p95_high_m"))
+    known = np.isfinite(p95 + low + high)
+    x, reach = horizons_m[rows][known] + shift_m, np.array([p95 - low, high - p95])[:, known]
+    axes.errorbar(x, p95[known], reach, **BAR_LOOK | {"color": pen["color"]})
+    return [(np.full(2, at), np.array(ends)) for at, *ends in zip(x, low[known], high[known], strict=True)]
 
 
 def _mark_reaches(
-    axes: Axes, reached: list[BudgetDistance], pens: Mapping[str, style.Look], lowest_m: float
+    axes: Axes, reached: Sequence[BudgetDistance], pens: Mapping[str, style.Look], lowest_m: float,
+    curves: Sequence[tuple[Floats, Floats]],
 ) -> None:  # fmt: skip
-    """Mark where models reach a budget: the nearest is written left of its curve, the others below, to the right."""
-    below_pt = LABEL_PT
-    for number, one in enumerate(sorted(reached, key=lambda one: one.distance_m)):
+    """Mark where models reach a budget, and write the distance where it covers no line."""
+    lines = list(curves)
+    for one in reached:
         pen = pens[one.model]
         axes.plot([one.distance_m] * 2, [lowest_m, one.budget_m], color=pen["color"], linewidth=0.7, zorder=1.5)
         axes.plot([one.distance_m], [one.budget_m], zorder=5, **style.spot("white", color=pen["color"]))
-        left = number == 0 and one.distance_m > SPACE_OF_LABEL * axes.get_xlim()[1]
-        offset_pt, ha, va = ((-5.0, 5.0), "right", "bottom") if left else ((5.0, -below_pt), "left", "top")
-        if not left and one.distance_m > (1.0 - SPACE_OF_LABEL) * axes.get_xlim()[1]:
-            offset_pt, ha = (-5.0, -below_pt), "right"
-        look: style.Look = {"ha": ha, "va": va, "color": pen["color"], "fontweight": "bold", "zorder": 6}
-        style.write_near(axes, f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), offset_pt, **look)
-        below_pt += 0.0 if left else LABEL_LINE_PT
+        lines.append((np.full(2, one.distance_m), np.array([lowest_m, one.budget_m])))
+        lines.append((np.array(axes.get_xlim()), np.full(2, one.budget_m)))
+    labels = [
+        Label(f"{one.distance_m:.1f} m", one.distance_m, one.budget_m, pens[one.model]["color"])
+        for one in sorted(reached, key=lambda one: one.distance_m)
+    ]
+    write_labels(axes, labels, lines, crossing=True, size_pt=9.0, fontweight="bold")
 
 
 def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float, heading: str) -> None:
@@ -235,7 +330,7 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     axes.set_xlim(0, end_m)
     axes.locator_params(axis="y", nbins=4)
     beyond = float(bins.percent[bins.left >= end_m].sum())
-    where: dict[str, Any] = {"transform": axes.transAxes, "bbox": style.LABEL_BOX}
+    where: dict[str, Any] = {"transform": axes.transAxes}
     if beyond >= MOSTLY_BEYOND_PCT:
         # Most trials are beyond the scale: a sentence replaces the bars.
         text = f"{beyond:.0f} % of the trials lie beyond this scale →"

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import math
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from matplotlib.transforms import Bbox
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
+from icrtool.output.figures.labels import Label, write_labels
+from icrtool.output.figures.sheet import new_sheet, styled
 from icrtool.output.figures.trajectory import (
-    CELLS_A_VIEW,
     JUMP_LOOK,
     draw_path,
     fitted_box_in,
@@ -22,32 +22,36 @@ from icrtool.output.figures.trajectory import (
     name_directions,
 )
 from icrtool.output.series import places, round_steps
-from icrtool.output.text_format import duration_text, error_text, run_title, turn_text
-from icrtool.records.dropout_document import ExampleTrial, Outage, TrialDocument
+from icrtool.output.text_format import (
+    direction_words,
+    duration_text,
+    error_text,
+    fix_word,
+    run_title,
+    turn_text,
+)
+from icrtool.records.dropout_document import ExampleTrial, Outage, PathErrors, TrialDocument
 from icrtool.records.rows import row_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WORST_COLUMNS, WORST_ROWS = 4, 2
+WORST_COLUMNS, WORST_ROWS = 3, 2
 WORST_CELL_IN = 2.15
-WORST_LAYOUT: Any = {"width_in": 9.6, "margins_in": (0.15, 0.15, 0.98, 0.5), "wspace": 0.12, "hspace": 0.27}
-CELL_TITLE: style.Look = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
+WORST_LAYOUT: Any = {"margins_in": (0.15, 0.15, 0.98, 0.5), "wspace": 0.12, "hspace": 0.27}
+CELL_TITLE: style.Look = {"loc": "left", "pad": 4.0, "fontsize": 8.5}
 
 OUTAGES = {"forced": style.line(style.BAD_FIX_COLOR, width=1.8), "real": style.line("black", (0, (2.0, 1.2)), 1.8)}
 PATH = style.line(style.FIX_COLOR, width=1.4)
 
-MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 5.3
-"""Half the size of a mark, height of a line of text, usual width of a character [points]."""
-LABEL_OFFSETS_PT = tuple(
-    (sign * dx, dy)
-    for dx in (7.0, 16.0, 32.0, 56.0)
-    for dy in (9.0, -9.0, 0.0, 18.0, -18.0, 32.0, -32.0, 48.0, -48.0)
-    for sign in (1, -1)
-)
-LINE_FROM_PT = 20.0
-"""Distance between a label and its point from which on a line joins them [points]."""
+NO_BREAK = "\N{NO-BREAK SPACE}"
+
+EXAMPLE_CHARACTERS = 44
+"""Characters in a line above a typical trial."""
+
+MAP_MARGINS_IN = (0.75, 1.1, 0.65, 1.0)
+"""Left, right, top and bottom of the axes of a picture with a colour bar [in]."""
 
 BAR_SHARE = 0.4
 """Largest length of the bar of a scale, as a share of the width."""
@@ -58,9 +62,11 @@ LOST_LOOK: style.Look = {"color": "0.82", "linewidth": 6.0, "solid_capstyle": "b
 SLOWEST_SHOWN_MPS = 0.001
 
 
-@style.styled
-def dropout_examples(report: DropoutReport) -> Figure:
+@styled
+def dropout_examples(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
     """Return a trial of about half a turn and the straightest one side by side [m]: reference, ICR, no slip.
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
     Raises
     ------
@@ -73,23 +79,29 @@ def dropout_examples(report: DropoutReport) -> Figure:
     what = "about half a turn (left), as straight as the drive has it (right)"
     title = f"Typical trials of {trials[0].horizon_m:g} m end {errors} off"
     subtitle = f"{run_title(report.run_document)}: {what}"
-    figure = style.new_figure(title, subtitle, height_in=4.7, margins_in=(0.75, 0.2, 1.0, 0.9), wspace=0.34)
-    panels = figure.subplots(1, len(examples), squeeze=False)[0]
+    sheet = new_sheet(title, subtitle, ax, height_in=4.9, margins_in=(0.75, 0.2, 1.2, 0.9), wspace=0.34)
+    panels = sheet.subplots(1, len(examples))[0]
+    across, up = direction_words(report.run_document)
     for axes, drive, trial in zip(panels, examples, trials, strict=True):
-        _draw_drive(axes, report, drive, shape=3.0 / 2.75)
+        _draw_drive(axes, report, drive)
         turn = turn_text(trial.heading_change_deg)
         facts = f"at {trial.t_s:.0f} s, turns {turn} at {trial.speed_mean_mps:.2f} m/s"
-        errors = ",  ".join(f"{name} {error_text(error)}" for name, error in trial.errors_m.items())
-        axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
-        axes.set_xlabel("East of start [m]")
-        axes.set_ylabel("North of start [m]")
-    style.add_legend(figure)
-    return figure
+        errors = ", ".join(
+            f"{name} {error_text(error)}".replace(" ", NO_BREAK) for name, error in trial.errors_m.items()
+        )
+        wrapped = textwrap.fill(f"end error: {errors}", EXAMPLE_CHARACTERS)
+        axes.set_title(f"{facts}\n{wrapped}", loc="left", pad=5.0)
+        axes.set_xlabel(f"{across} from start [m]")
+        axes.set_ylabel(f"{up} from start [m]")
+    sheet.legend()
+    return sheet.finished()
 
 
-@style.styled
-def dropout_worst(report: DropoutReport) -> Figure:
+@styled
+def dropout_worst(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
     """Return the worst trials [m], each in a cell with its own scale; the first cell shows where they start.
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
     Raises
     ------
@@ -102,42 +114,32 @@ def dropout_worst(report: DropoutReport) -> Figure:
     which = f"{model}, the {len(worst)} worst trials, none overlapping"
     title = f"The worst trial of {first.horizon_m:g} m ends {error_text(first.errors_m[model])} off"
     subtitle, height_in = f"{run_title(report.run_document)}: {which}", 1.0 + rows * (WORST_CELL_IN + 0.5)
-    figure = style.new_figure(title, subtitle, height_in=height_in, **WORST_LAYOUT)
-    panels = figure.subplots(rows, WORST_COLUMNS, squeeze=False).ravel()
+    sheet = new_sheet(title, subtitle, ax, height_in=height_in, **WORST_LAYOUT)
+    panels = sheet.subplots(rows, WORST_COLUMNS).ravel()
     for axes in panels:
         axes.spines[["top", "right"]].set_visible(True)
         axes.spines[:].set_color(FRAME_COLOR)
     _draw_overview(panels[0], [one.document for one in worst], report.reference_north_m, report.reference_east_m)
     for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
-        _draw_drive(axes, report, drive, shape=1.0, ticks=0)
+        _draw_drive(axes, report, drive, ticks=0)
         _draw_scale(axes)
         trial = drive.document
         facts = f"at {duration_text(trial.t_s)}, {turn_text(trial.heading_change_deg)}, {trial.speed_mean_mps:.2f} m/s"
         axes.set_title(f"{rank}:  {error_text(trial.errors_m[model])}\n{facts}", **CELL_TITLE)
     for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
-    style.add_legend(figure)
-    return figure
+    sheet.legend()
+    return sheet.finished()
 
 
 def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, east_m: Floats) -> None:
-    """Draw the whole path and the numbered starts of the trials; numbers that would touch are written in a row."""
-    cell = look_down(axes, north_m, east_m, 1.0, ticks=0)
+    """Draw the whole path and the numbered starts of the trials."""
+    cell = look_down(axes, north_m, east_m, margin=0.12, ticks=0)
     draw_path(axes, north_m, east_m, cell, PATH, zorder=2)
-    number_pt, line_pt = 1.1 * CHARACTER_PT, 0.8 * LINE_PT
-    point_m = cell * CELLS_A_VIEW / (72.0 * WORST_CELL_IN)
-    together: list[tuple[float, float, list[int]]] = []
-    for rank, trial in enumerate(worst, start=1):
-        for north, east, ranks in together:
-            half_pt = number_pt * (len(ranks) + 1) + 2.0
-            if abs(trial.north_m - north) < line_pt * point_m and abs(trial.east_m - east) < half_pt * point_m:
-                ranks.append(rank)
-                break
-        else:
-            together.append((trial.north_m, trial.east_m, [rank]))
-    for north, east, ranks in together:
-        look: style.Look = {"fontsize": 8.0, "fontweight": "bold", "ha": "center", "va": "center", "zorder": 3}
-        style.write_near(axes, " ".join(map(str, ranks)), (east, north), **look)
+    starts = [(trial.east_m, trial.north_m) for trial in worst]
+    axes.plot(*zip(*starts, strict=True), zorder=3, **style.spot("white", 4.0))
+    labels = [Label(str(rank), *place) for rank, place in enumerate(starts, start=1)]
+    write_labels(axes, labels, [(east_m, north_m)], crossing=True, fontweight="bold")
     _draw_scale(axes)
     axes.set_title("where they start\non the whole path", **CELL_TITLE)
 
@@ -163,9 +165,11 @@ def _draw_scale(axes: Axes) -> None:
     style.write_near(axes, f"{length:g} m", (x + length / 2, y), (0.0, 2.0), **look)
 
 
-@style.styled
-def dropout_outages(report: DropoutReport) -> Figure:
+@styled
+def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
     """Return the path [m] with its forced and real outages, and their end errors [m].
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
     Raises
     ------
@@ -184,11 +188,13 @@ def dropout_outages(report: DropoutReport) -> Figure:
             worst = max(one.end_error_m or 0.0 for one in ours)
             lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
             span = " to ".join(duration_text(length) for length in dict.fromkeys((lengths[0], lengths[-1])))
-            parts.append(f"{len(ours)} {kind} of {span}, end error up to {error_text(worst)}")
-    title = f"Outages: {'; '.join(parts)}"
-    figure = style.new_figure(title, run_title(report.run_document), height_in=box_in + 1.65)
-    axes = figure.subplots()
-    cell = look_down(axes, norths, easts, width_in / box_in, ticks=9)
+            parts.append(f"{len(ours)} {kind} of {span}, up to {error_text(worst)}")
+    largest = max(one.document.end_error_m or 0.0 for one in outages)
+    title = f"Without {fix_word(report.run_document)} the robot ends up to {error_text(largest)} off"
+    subtitle = f"{run_title(report.run_document)}: {'; '.join(parts)}"
+    sheet = new_sheet(title, subtitle, ax, height_in=box_in + 1.65)
+    axes = sheet.subplots()[0, 0]
+    cell = look_down(axes, norths, easts, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
     for one in outages:
         kind = one.document.kind
@@ -196,13 +202,113 @@ def dropout_outages(report: DropoutReport) -> Figure:
     for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
         ends = [(one.east_m[row], one.north_m[row]) for one in outages]
         axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **style.spot(fill))
-    _write_errors(axes, outages)
-    name_directions(axes)
-    style.add_legend(figure)
-    return figure
+    # Number and end error near the end of each outage where there is space; the tables hold all of them.
+    labels = [
+        Label(f"{number}: {error_text(one.document.end_error_m)}", float(one.east_m[-1]), float(one.north_m[-1]))
+        for number, one in enumerate(outages, start=1)
+    ]
+    lines = [(one.east_m, one.north_m) for one in outages]
+    begins = [(float(one.east_m[0]), float(one.north_m[0])) for one in outages]
+    lines.append((report.reference_east_m, report.reference_north_m))
+    write_labels(axes, labels, lines, crossing=True, marks=begins)
+    name_directions(axes, report.run_document)
+    sheet.legend()
+    return sheet.finished()
 
 
-Content = TypeVar("Content", ExampleTrial, Outage)
+ERROR_MAP = "viridis_r"
+"""Colours of errors: their lightness decreases evenly with the error, in colour and in grey."""
+LIGHTEST = 0.08
+"""Part of this map that is left out: it would not be seen on white paper."""
+
+ERROR_STEPS = 7.0
+"""Approximate number of steps of the colours. An error is read from a step, not from a gradient."""
+
+UNSCORED = style.line("0.80", width=1.0)
+ERROR_LINE_PT = 3.4
+MOST_OF_P95 = 1.5
+"""Largest ratio of the end of the colours to the 95 % error. Larger errors have the last colour."""
+
+CELLS_A_STEP = 3.0
+"""Length of a coloured part of the path, in cells of the view."""
+
+MARKED_WORST = 3
+
+
+@styled
+def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
+    """Return the path [m], each place coloured by the error [m] of the trial that starts there.
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
+
+    Raises
+    ------
+    DataError
+        The report holds none; `icrtool.dropout_report` makes one that does.
+    """
+    from matplotlib import colormaps
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    (errors,) = _needed(report, () if report.path_errors is None else (report.path_errors,), "errors along the path")
+    north, east, after = report.reference_north_m, report.reference_east_m, f"{errors.horizon_m:g} m"
+    p95, most = float(np.quantile(errors.error_m, 0.95)), float(errors.error_m.max())
+    title = f"95 % of the trials end within {error_text(p95)} after {after}, the worst {error_text(most)}"
+    subtitle = f"{run_title(report.run_document)}: {errors.model}, {len(errors.error_m):,} trials, each at its start"
+    box_in = fitted_box_in(north, east, style.WIDTH_IN - sum(MAP_MARGINS_IN[:2]))
+    sheet = new_sheet(
+        title, subtitle, ax, height_in=box_in + sum(MAP_MARGINS_IN[2:]), margins_in=MAP_MARGINS_IN
+    )  # fmt: skip
+    axes = sheet.subplots()[0, 0]
+    cell = look_down(axes, north, east, margin=0.06, ticks=9)
+    draw_path(axes, north, east, cell, UNSCORED, zorder=2, label="no trial starts here")
+    rows = places(north, east, CELLS_A_STEP * cell)
+    # Each part of the path has its largest error; a part without a start has that of the last start before it, up to
+    # twice the usual distance between starts.
+    nearest = np.maximum(np.searchsorted(errors.start, rows[:-1], side="right") - 1, 0)
+    spacing = float(np.median(np.diff(errors.start))) if len(errors.start) > 1 else 1.0
+    behind = rows[:-1] - errors.start[nearest]
+    error_m = np.where((behind >= 0) & (behind <= 2.0 * spacing), errors.error_m[nearest], np.nan)
+    inside = np.searchsorted(rows, errors.start, side="right") - 1
+    largest = np.full(len(rows), np.nan)
+    np.fmax.at(largest, inside, errors.error_m)
+    error_m = np.where(np.isfinite(largest[:-1]), largest[:-1], error_m)
+    # The largest errors lie on top.
+    shown = np.flatnonzero(np.isfinite(error_m))
+    shown = shown[np.argsort(error_m[shown], kind="stable")]
+    place = np.column_stack([east[rows], north[rows]])
+    end = min(most, MOST_OF_P95 * p95) or 1.0
+    step = float(min(round_steps(end / ERROR_STEPS), key=lambda one: abs(one - end / ERROR_STEPS)))
+    steps = step * np.arange(np.ceil(end / step) + 1)
+    shades = ListedColormap(colormaps[ERROR_MAP](np.linspace(LIGHTEST, 1.0, len(steps) - 1)))
+    lines = LineCollection(
+        np.stack([place[shown], place[shown + 1]], axis=1).tolist(), cmap=shades, linewidths=ERROR_LINE_PT,
+        norm=BoundaryNorm(steps, len(steps) - 1), capstyle="round", zorder=3,
+    )  # fmt: skip
+    lines.set_array(error_m[shown])
+    axes.add_collection(lines, autolim=False)
+    beyond = "max" if most > steps[-1] else "neither"
+    bar = axes.figure.colorbar(lines, cax=axes.inset_axes((1.03, 0.0, 0.03, 1.0)), extend=beyond)
+    bar.set_label(f"Error after {after} from there [m]")
+    bar.outline.set_visible(False)
+    bar.ax.axhline(p95, color=style.BUDGET["color"], linewidth=1.6)
+    left: style.Look = {"ha": "right", "va": "center", "fontsize": 8.0, "color": style.BUDGET["color"]}
+    style.write_near(bar.ax, "95 %", (0.0, p95), (-3.0, 0.0), xycoords=bar.ax.get_yaxis_transform(), **left)
+    worst = [(trial.document.east_m, trial.document.north_m) for trial in report.worst[:MARKED_WORST]]
+    if worst:
+        label = f"the worst {len(worst)} that do not overlap" if len(worst) > 1 else "the worst"
+        axes.plot(*zip(*worst, strict=True), zorder=5, label=label, **style.spot("none", 9.0, color="black"))
+        labels = [
+            Label(f"{rank}: {error_text(trial.document.errors_m[trial.document.model])}", *at)
+            for rank, (at, trial) in enumerate(zip(worst, report.worst, strict=False), start=1)
+        ]
+        write_labels(axes, labels, [(east, north)], crossing=True, fontweight="bold")
+    name_directions(axes, report.run_document)
+    sheet.legend()
+    return sheet.finished()
+
+
+Content = TypeVar("Content", ExampleTrial, Outage, PathErrors)
 
 
 def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> tuple[Content, ...]:
@@ -211,15 +317,15 @@ def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> t
     return content
 
 
-def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: float, ticks: int = 5) -> None:
-    """Draw one trial about its start in axes `shape` times as wide as high."""
+def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, ticks: int = 5) -> None:
+    """Draw one trial about its start."""
     trial, pens = drive.document, style.row_pens(drive.paths)
     lines = [(drive.reference_north_m, drive.reference_east_m, style.FILTER, "filter")]
     drawn = {name: path for name, path in drive.paths.items() if row_of(name).compared or name == trial.model}
     lines += [(path.north, path.east, pens[name], name) for name, path in drawn.items()]
     lines = [(north - trial.north_m, east - trial.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
-    cell = look_down(axes, norths, easts, shape, ticks=ticks)
+    cell = look_down(axes, norths, easts, ticks=ticks)
     axes.plot([0.0], [0.0], zorder=6, label="start", **style.spot("white"))
     for order, (north, east, pen, label) in enumerate(lines):
         draw_path(axes, north, east, cell, pen, zorder=2 + min(order, 1), label=label)
@@ -235,37 +341,3 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
     if jumps:
         place = [[one.east_m - trial.east_m for one in jumps], [one.north_m - trial.north_m for one in jumps]]
         axes.plot(*place, label="step of the reference", **JUMP_LOOK)
-
-
-def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
-    """Write number and end error near the end of each outage where there is space; the tables hold all of them."""
-    axes.apply_aspect()
-    point_px, frame = axes.figure.dpi / 72.0, axes.bbox
-
-    def spots(path: Floats) -> list[Bbox]:
-        return [Bbox([place, place]).padded(MARK_PT * point_px) for place in path]
-
-    paths = [axes.transData.transform(np.column_stack([one.east_m, one.north_m])) for one in outages]
-    taken, crossed = [], []
-    for path in paths:
-        taken += spots(path[[0, -1]])
-        crossed += spots(path[places(path[:, 1], path[:, 0], LINE_PT * point_px)])
-    height = point_px * LINE_PT
-    for number, (one, path) in enumerate(zip(outages, paths, strict=True), start=1):
-        text = f"{number}: {error_text(one.document.end_error_m)}"
-        width = point_px * CHARACTER_PT * len(text)
-        # Places of the label within the frame, nearest first. Crossing a path is better than crossing another label.
-        boxes = {}
-        for dx, dy in LABEL_OFFSETS_PT:
-            x, y = path[-1] + point_px * np.array([dx, dy]) - (width if dx <= 0 else 0.0, height / 2)
-            if frame.x0 < x and frame.y0 < y and x + width < frame.x1 and y + height < frame.y1:
-                boxes[dx, dy] = Bbox.from_bounds(x, y, width, height)
-        free = [offset for offset, box in boxes.items() if not box.count_overlaps(taken)]
-        if not free:
-            continue
-        found = next((offset for offset in free if not boxes[offset].count_overlaps(crossed)), free[0])
-        taken.append(boxes[found])
-        line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(*found) > LINE_FROM_PT else None
-        side = "left" if found[0] > 0 else "right"
-        look: style.Look = {"ha": side, "va": "center", "fontsize": 8.0, "zorder": 6, "arrowprops": line}
-        style.write_near(axes, text, (float(one.east_m[-1]), float(one.north_m[-1])), found, **look)

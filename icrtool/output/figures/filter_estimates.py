@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from icrtool.estimation.convergence import icr_std_m
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.output.figures import style
+from icrtool.output.figures.sheet import new_sheet, styled
 from icrtool.output.series import (
     LEAST_HALF_RANGE_M,
     ORANGE,
@@ -19,7 +21,7 @@ from icrtool.output.series import (
     scale_end_m,
     scale_of,
 )
-from icrtool.output.text_format import error_text, position_word, run_title, signed
+from icrtool.output.text_format import error_text, fix_word, position_word, run_title, signed
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import IcrColumn
 
@@ -38,6 +40,14 @@ BAND_RANGE_PERCENT = (2.0, 98.0)
 CLUSTER_RANGE_PERCENT = (0.5, 99.5)
 """Percentiles, as `RANGE_PERCENT`, for the edges of a band and of a histogram."""
 
+DRIVE_BEHIND = 0.02
+"""Distance between the end of the time and the ICR of the whole drive, as a share of the axis."""
+
+DRIVE_LOOK: style.Look = {
+    "marker": "s", "markersize": 4.0, "color": style.ICR["color"], "linestyle": "none", "elinewidth": 1.4,
+    "capsize": 2.0,
+}  # fmt: skip
+
 LONG_RUN = 2.5
 """Ratio of the run to its learning time from which on the learning has its own panel."""
 LEARNING_MARGIN = 0.6
@@ -52,11 +62,13 @@ def _time_axis(span_s: float) -> tuple[str, float]:
     return f"Time [{unit}]", seconds
 
 
-@style.styled
-def icr_estimates(run: Run) -> Figure:
-    """Return the three ICR estimates over time with ±1σ, start and convergence, b/2 where known, and GNSS outages.
+@styled
+def icr_estimates(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
+    """Return the three ICR estimates over time with ±1σ, start and convergence, b/2 where known, and outages.
 
-    A long run has two columns, each with its own scale: the learning, and what follows.
+    A long run has two columns, each with its own scale: the learning, and what follows. Behind the end stand the ICRs
+    of the whole drive, which the text states first. `ax`: axes to draw into, which are returned; by default the picture
+    is a new figure.
     """
     finals, stds = run.document.icr.final, run.document.icr.final_std
     ends = ", ".join(f"{ICR_WORDS[one]} {signed(at)} m" for one in ICR_COLUMNS if (at := finals[one]) is not None)
@@ -70,40 +82,44 @@ def icr_estimates(run: Run) -> Figure:
         if spans[0][1] - begin > LONG_RUN * (end - begin):
             spans = [(begin, end), (end, spans[0][1])]
     learning = "; left: learning, right: after it" if len(spans) > 1 else ""
-    figure = style.new_figure(
+    sheet = new_sheet(
         title if ends else f"This drive does not show its ICRs: {unknown}",
-        f"{run_title(run.document)}: estimates of the filter{learning}",
-        height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3,
+        f"{run_title(run.document)}: estimates of the filter{learning}", ax,
+        height_in=6.0, margins_in=(0.75, 0.2, 0.8, 1.05), wspace=0.22, hspace=0.3,
     )  # fmt: skip
-    widths = {"width_ratios": (2, 3)[: len(spans)]}
-    panels = figure.subplots(3, len(spans), squeeze=False, sharex="col", gridspec_kw=widths)
+    panels = sheet.subplots(3, len(spans), sharex="col", width_ratios=(2, 3)[: len(spans)])
     for row, column in zip(panels, ICR_COLUMNS, strict=True):
         for axes, span in zip(row, spans, strict=True):
-            _draw_estimate(axes, run, column, span, first=axes is row[0])
+            _draw_estimate(axes, run, column, span, first=axes is row[0], last=axes is row[-1])
         row[0].set_ylabel(f"ICR {ICR_WORDS[column]} [m]")
         settling, final = run.convergence_s[column], finals[column]
         without = "known from the start" if run.began_with is not None else "does not converge"
         found = f"10–90 % in {settling[1] - settling[0]:.1f} s" if settling else without
         row[0].set_title(found, loc="left", pad=4.0)
         found = f"final {signed(final)} ± {stds[column]:.3f} m" if final is not None else "not shown by this drive"
+        if final is not None and (of_drive := run.document.icr_of_drive(column)) is not None:
+            found += f", drive {signed(of_drive[0])} ± {of_drive[1]:.3f} m"
         row[-1].set_title(found, loc="right", pad=4.0)
     for axes, (begin, end) in zip(panels[-1], spans, strict=True):
         axes.set_xlabel(_time_axis(end - begin)[0])
-    style.add_legend(figure, columnspacing=1.4, handlelength=2.0)
-    return figure
+    sheet.legend(ncols=4, columnspacing=1.4, handlelength=2.0)
+    return sheet.finished()
 
 
-@style.styled
-def icr_clusters(run: Run) -> Figure:
-    """Return histograms of the three ICR estimates [m] after convergence, in percent of the time."""
+@styled
+def icr_clusters(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
+    """Return histograms of the three ICR estimates [m] after convergence, in percent of the time.
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
+    """
     settled = run.settled_s
     after = run.table.t_s >= settled
     mean, std = run.document.icr.mean, run.document.icr.std
     spread = [f"{ICR_WORDS[column]} ±{std[column]:.3f} m" for column in ICR_COLUMNS if mean[column] is not None]
     title = f"The ICRs scatter by {', '.join(spread)}" if spread else "No ICR is shown"
     subtitle = f"{run_title(run.document)}: estimates from {settled:.1f} s on"
-    figure = style.new_figure(title, subtitle, height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.9))
-    panels = figure.subplots(1, 3, sharey=True)
+    sheet = new_sheet(title, subtitle, ax, height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.95))
+    panels = sheet.subplots(1, 3, sharey=True)[0]
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
     columns: tuple[IcrColumn, ...] = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
     values: list[Floats] = [getattr(run.table, column)[after] for column in columns]
@@ -112,20 +128,25 @@ def icr_clusters(run: Run) -> Figure:
     for axes, column, value in zip(panels, columns, values, strict=True):
         _draw_histogram(axes, run, column, value, weight, span)
     panels[0].set_ylabel("Time [%]")
-    style.add_legend(figure, columnspacing=3.0)
-    return figure
+    sheet.legend(columnspacing=3.0)
+    return sheet.finished()
 
 
-def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float, float], *, first: bool) -> None:
-    """Draw one estimate over a span; the `first` panel also has b/2 and the begin and end of the convergence."""
+def _draw_estimate(
+    axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float, float], *, first: bool, last: bool
+) -> None:  # fmt: skip
+    """Draw one estimate over a span.
+
+    The `first` panel also has b/2 and the begin and end of the convergence, the `last` one the ICR of the whole drive.
+    """
     table, unit = run.table, _time_axis(span_s[1] - span_s[0])[1]
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
-    t, value, std = table.t_s[rows], getattr(table, column)[rows], getattr(table, f"std_{column}")[rows]
+    t, value, std = table.t_s[rows], getattr(table, column)[rows], icr_std_m(run, column)[rows]
     shown = extremes(value)
     axes.plot(t[shown] / unit, value[shown], color="black", linewidth=1.0, label="estimate")
     low, high = value - std, value + std
     shown = extremes(low, high)
-    axes.fill_between(t[shown] / unit, low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="±1σ")
+    axes.fill_between(t[shown] / unit, low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="its ±1σ")
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
         # At the start the band is as wide as the spread of robots: it is shown to one standard deviation.
@@ -139,7 +160,14 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
             axes.axhline(spread[-1], **NO_SLIP_PLACE)
     else:
         spread += [*percentiles(low, BAND_RANGE_PERCENT[:1]), *percentiles(high, BAND_RANGE_PERCENT[1:])]
-    axes.set_xlim(span_s[0] / unit, max(span_s[1] / unit, span_s[0] / unit + 1e-3))
+    begin, end = span_s[0] / unit, max(span_s[1] / unit, span_s[0] / unit + 1e-3)
+    axes.set_xlim(begin, end)
+    if last and (of_drive := run.document.icr_of_drive(column)) is not None:
+        place, reach = of_drive
+        spread += [place - reach, place + reach]
+        axes.errorbar(
+            [end + DRIVE_BEHIND * (end - begin)], [place], [reach], clip_on=False, label="whole drive ±1σ", **DRIVE_LOOK
+        )
     axes.set_ylim(*scale_of(spread))
     axes.locator_params(axis="y", nbins=5)
     for change in run.changes_s:
@@ -148,12 +176,12 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
         if (mean := segment.mean[column]) is not None:
             stretch = segment.begin_s / unit, segment.end_s / unit
             axes.plot(stretch, (mean, mean), zorder=2.5, label="mean between", **SEGMENT)
-    _shade_outages(axes, run, unit, "no usable GNSS")
+    _shade_outages(axes, run, unit, f"no usable {fix_word(run.document)}")
     # If the panel cuts off an extreme of the estimate, its value is written at the edge.
     low_end, high_end = axes.get_ylim()
     for row, edge, arrow in ((int(value.argmin()), low_end, "↓"), (int(value.argmax()), high_end, "↑")):
         if not low_end <= value[row] <= high_end:
-            text, va = f"{arrow} {signed(value[row])}", "top" if edge == high_end else "bottom"
+            text, va = f" {arrow} {signed(value[row])}", "top" if edge == high_end else "bottom"
             style.write_near(axes, text, (t[row] / unit, edge), va=va, fontsize=7.5, color=style.BAD_FIX_COLOR)
 
 
@@ -202,11 +230,12 @@ MOST_CROSSES = 400
 """Largest number of rejected fixes that are drawn one by one. Of more, the extremes are drawn."""
 
 
-@style.styled
-def gnss_difference(run: Run) -> Figure:
+@styled
+def gnss_difference(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     """Return the distance between filter and fixes [m] over time, with separate marks for rejected fixes.
 
-    If there are many fixes, the range and the median in each of `TIME_BINS` equal times are drawn.
+    If there are many fixes, the range and the median in each of `TIME_BINS` equal times are drawn. `ax`: axes to draw
+    into, which are returned; by default the picture is a new figure.
     """
     facts, duration_s, fixes = run.document.gnss, float(run.table.t_s[-1]), run.sensors.fixes
     mean, most = facts.mean_difference_m, facts.max_difference_m
@@ -214,8 +243,8 @@ def gnss_difference(run: Run) -> Figure:
     apart = f"{error_text(mean)} from the {word} on average, " if mean is not None else ""
     title = f"Filter {apart}{100 * facts.rejected / max(of, 1):.0f} % rejected"
     subtitle = f"{run_title(run.document)}: distance between filter and {word}, {of:,} of them"
-    figure = style.new_figure(title, subtitle, height_in=3.9)
-    axes = figure.subplots()
+    sheet = new_sheet(title, subtitle, ax, height_in=3.9)
+    axes = sheet.subplots()[0, 0]
     name, unit = _time_axis(duration_s)
     t, difference = run.gnss.t_s / unit, run.gnss.difference
     used, weak = run.gnss.used, run.gnss.used & fixes.down_weighted
@@ -227,13 +256,10 @@ def gnss_difference(run: Run) -> Figure:
     _mark(axes, t, difference, run.gnss.rejected, top, "rejected", "x", color=style.BAD_FIX_COLOR, markersize=4.5)
     _mark(axes, t, difference, weak, top, "down-weighted", ".", color=style.FLOAT_COLOR, markersize=4.0)
     lost = len(run.sensors.losses_ns) > 0
-    _shade_outages(axes, run, unit, "no usable GNSS, or RTK lost" if lost else "no usable GNSS")
+    _shade_outages(axes, run, unit, f"no usable {fix_word(run.document)}{', or RTK lost' if lost else ''}")
     axes.set(xlim=(0, max(duration_s / unit, 1e-3)), ylim=(0, top), xlabel=name, ylabel="Difference [m]")
-    # Five short entries fit in one row; more or longer entries need two rows.
-    style.add_legend(
-        figure, ncols=3 if lost or fixes.down_weighted.any() else 5, columnspacing=1.6, handlelength=2.0
-    )  # fmt: skip
-    return figure
+    sheet.legend(ncols=3, columnspacing=1.6, handlelength=2.0)
+    return sheet.finished()
 
 
 def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:

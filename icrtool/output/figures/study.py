@@ -14,6 +14,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
+from icrtool.output.figures.sheet import new_sheet, styled
 from icrtool.output.series import BLUE, GREEN, ORANGE, RED
 from icrtool.output.tables.study import finding_text, runs_text
 from icrtool.output.text_format import signed
@@ -73,8 +74,8 @@ Draw = Callable[["Axes", StudyResult, list[Level]], None]
 """Draws the levels of one series."""
 
 
-@style.styled
-def study_figure(result: StudyResult) -> Figure:
+@styled
+def study_figure(result: StudyResult, *, ax: Axes | None = None) -> Figure | Axes:
     """Return the picture of a study."""
     rows = STUDY_PICTURES[result.request.name]
     names = dict.fromkeys(level.setting.series for level in result.levels)
@@ -82,8 +83,8 @@ def study_figure(result: StudyResult) -> Figure:
     columns = [list(result.levels)] if result.request.name in TOGETHER else of_series
     title, subtitle, height_in = study_title(result), study_subtitle(result), 1.7 + PANEL_IN * len(rows)
     margins_in = (0.85, 0.2, 0.75, 1.2)
-    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, wspace=0.12, hspace=0.5)
-    panels = figure.subplots(len(rows), len(columns), squeeze=False, sharey="row")
+    sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=margins_in, wspace=0.12, hspace=0.5)
+    panels = sheet.subplots(len(rows), len(columns), sharey="row")
     for column, levels in enumerate(columns):
         name = levels[0].setting.series
         if len(columns) > 1:
@@ -91,8 +92,8 @@ def study_figure(result: StudyResult) -> Figure:
         for row, (label, draw) in enumerate(rows):
             draw(panels[row][column], result, levels)
             panels[row][0].set_ylabel(label)
-    style.add_legend(figure, title=NOTES.get(result.request.name, NOTE), ncols=5)
-    return figure
+    sheet.legend(title=NOTES.get(result.request.name, NOTE), ncols=5)
+    return sheet.finished()
 
 
 def _varied(result: StudyResult) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import matplotlib as mpl
 import numpy as np
@@ -15,7 +14,6 @@ from matplotlib import font_manager
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-from matplotlib.transforms import ScaledTranslation
 from PIL import Image
 
 from icrtool.kernels.arrays import Floats
@@ -24,24 +22,28 @@ from icrtool.records.rows import Color, Dash, rows_of
 from icrtool.records.text import LONGEST_MESSAGE, escaped, shortened
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-
-P = ParamSpec("P")
 
 PNG_DPI = 130
 
 WIDTH_IN = 7.2
 """Width of most figures [in]: the text width of a page."""
 
-KEY_ROW_IN = 0.19
+KEY_ROW_IN = 0.2
 """Height of a row of a legend [in]. Figures have space for two rows."""
 
-TITLE_CHARACTERS_PER_INCH, SUBTITLE_CHARACTERS_PER_INCH = 10.0, 14.0
+TITLE_CHARACTERS_PER_INCH, SUBTITLE_CHARACTERS_PER_INCH = 9.75, 13.5
+TITLE_PT, SUBTITLE_PT = 10.8, 9.0
+
+MARGINS_IN = (0.75, 0.2, 0.65, 1.05)
+"""Left, right, top and bottom of the axes of most figures [in]."""
 
 WEIGHTS = ("regular", "bold")
 """Weights of the titles' font."""
+
+BACKGROUND = "white"
+"""Background of every picture, also on a dark page: the PNG files are opaque."""
 
 MISSING = "\u25a1"
 """Character that is drawn for a character that the font lacks."""
@@ -51,10 +53,10 @@ Look = dict[str, Any]
 
 RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
-    "font.size": 9.0,
-    "axes.titlesize": 9.0,
+    "font.size": 9.5,
+    "axes.titlesize": 9.5,
     "axes.titley": 1.0,
-    "axes.labelsize": 9.0,
+    "axes.labelsize": 9.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.linewidth": 0.7,
@@ -64,13 +66,13 @@ RC: dict[str, Any] = {
     "grid.color": "0.88",
     "grid.linewidth": 0.6,
     "lines.linewidth": 1.3,
-    "legend.fontsize": 8.5,
+    "legend.fontsize": 9.0,
     "legend.frameon": False,
     "legend.handlelength": 2.4,
     "legend.columnspacing": 1.8,
     "legend.loc": "lower center",
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
+    "xtick.labelsize": 9.0,
+    "ytick.labelsize": 9.0,
     "agg.path.chunksize": 20000,
     "svg.hashsalt": "icrtool",
     "pdf.fonttype": 42,
@@ -86,10 +88,6 @@ PNG_COLORS = 256
 """Number of colours of a PNG file. It needs half of the time and a third of the bytes of full colour and looks the
 same."""
 NEARLY_WHITE = 252
-
-LABEL_BELOW_IN, LABEL_LEFT_IN = 0.31, 0.54
-"""Distance of the names of axes below and left of them [in]. Fixed distances save matplotlib two layouts of all
-ticks."""
 
 
 def line(color: str, dash: str | tuple[float, tuple[float, ...]] = "-", width: float = 1.3) -> Look:
@@ -131,10 +129,6 @@ ICR_LOOKS: dict[str, Look] = {
 """Looks of the three ICRs in a common panel, by `icrtool.simulation.study_runs.ICR_NAMES`."""
 
 
-LABEL_BOX: Look = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
-"""Box behind text that lies on lines."""
-
-
 @contextmanager
 def style() -> Iterator[None]:
     """Draw with the settings of this module and matplotlib's defaults; a matplotlibrc has no effect."""
@@ -146,26 +140,9 @@ def style() -> Iterator[None]:
         yield
 
 
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Return a function that draws in our style, with the names of the axes at fixed places."""
-
-    @wraps(draw)
-    def drawn(*args: P.args, **keywords: P.kwargs) -> Figure:
-        with style():
-            figure = draw(*args, **keywords)
-            below = ScaledTranslation(0.0, -LABEL_BELOW_IN, figure.dpi_scale_trans)
-            left = ScaledTranslation(-LABEL_LEFT_IN, 0.0, figure.dpi_scale_trans)
-            for axes in figure.axes:
-                axes.xaxis.set_label_coords(0.5, 0.0, axes.transAxes + below)
-                axes.yaxis.set_label_coords(0.0, 0.5, axes.transAxes + left)
-            return figure
-
-    return drawn
-
-
 def new_figure(
     title: str, subtitle: str, *, height_in: float, width_in: float = WIDTH_IN,
-    margins_in: tuple[float, float, float, float] = (0.75, 0.2, 0.65, 1.0), wspace: float = 0.2, hspace: float = 0.2,
+    margins_in: tuple[float, float, float, float] = MARGINS_IN, wspace: float = 0.2, hspace: float = 0.2,
 ) -> Figure:  # fmt: skip
     """Return an empty figure with two lines of title at its upper left.
 
@@ -176,7 +153,7 @@ def new_figure(
     margins_in : left, right, top and bottom of its axes [in]
     wspace, hspace : between axes, as a share of their width and height
     """
-    figure = Figure(figsize=(width_in, height_in), dpi=PNG_DPI)
+    figure = Figure(figsize=(width_in, height_in), dpi=PNG_DPI, facecolor=BACKGROUND)
     FigureCanvasAgg(figure)
     left, right, top, bottom = margins_in
     figure.subplots_adjust(
@@ -185,22 +162,10 @@ def new_figure(
     edge = 0.09 / width_in
     most = int(TITLE_CHARACTERS_PER_INCH * width_in)
     at: Look = {"va": "top", "ha": "left", "parse_math": False}
-    figure.text(edge, 1 - 0.09 / height_in, drawable(title, most), fontsize=10.5, fontweight="bold", **at)
+    figure.text(edge, 1 - 0.09 / height_in, drawable(title, most), fontsize=TITLE_PT, fontweight="bold", **at)
     most = int(SUBTITLE_CHARACTERS_PER_INCH * width_in)
-    figure.text(edge, 1 - 0.30 / height_in, drawable(subtitle, most), fontsize=8.5, color="0.3", **at)
+    figure.text(edge, 1 - 0.32 / height_in, drawable(subtitle, most), fontsize=SUBTITLE_PT, color="0.3", **at)
     return figure
-
-
-def add_legend(figure: Figure, **layout: Any) -> None:
-    """Add a legend below all axes with each label once; in one row where `layout` has no number of columns."""
-    found: dict[str, Artist] = {}
-    for axes in figure.axes:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(str(label), handle)
-    if found:
-        legend = figure.legend(found.values(), found.keys(), **{"ncols": len(found)} | layout)
-        for text in legend.get_texts():
-            text.set_parse_math(False)
 
 
 def spot(fill: str, size: float = 5.5, marker: str = "o", color: str = "black") -> Look:
@@ -211,8 +176,8 @@ def spot(fill: str, size: float = 5.5, marker: str = "o", color: str = "black") 
 def write_near(
     axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[float, float] = (0.0, 0.0), **look: Any
 ) -> None:
-    """Write a text at an offset [points] from a place, on a box that hides the lines below it."""
-    axes.annotate(text, place, xytext=offset_pt, textcoords="offset points", **{"bbox": LABEL_BOX} | look)
+    """Write a text at an offset [points] from a place, without a box: a box would hide the lines below it."""
+    axes.annotate(text, place, xytext=offset_pt, textcoords="offset points", **look)
 
 
 def drawable(text: str, longest: int = LONGEST_MESSAGE) -> str:

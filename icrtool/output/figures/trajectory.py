@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +12,12 @@ from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
 from icrtool.estimation.odometry import OdometryName, OdometryPath, drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
+from icrtool.output.figures.labels import Label, write_labels
+from icrtool.output.figures.sheet import new_sheet, styled
 from icrtool.output.series import places
-from icrtool.output.text_format import PATH_WORDS, driven_text, error_text, position_word, run_title
+from icrtool.output.text_format import PATH_WORDS, direction_words, driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run
+from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
 from icrtool.records.text import distance_text
@@ -21,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MARGINS_IN = (0.75, 0.2, 0.6, 1.3)
+PATH_MARGINS_IN = (0.75, 0.2, 0.65, 1.45)
 
 LARGEST_DETOUR = 0.75
 """Distance outside the filter's path to which odometry is shown, in sizes of this path. Further parts are cut off."""
@@ -39,6 +44,11 @@ MOST_REJECTED = 60
 
 TIME_CLEARANCE = 0.06
 """Smallest distance between two times that are written at the path, as a share of the view."""
+
+TIME_PT = 7.5
+"""Size of these times [points]."""
+TIME_NEAR_PT = 22.0
+"""Largest distance between a time and its place [points]."""
 
 Corners = tuple[Floats, Floats]
 """Least and greatest (north, east) [m]."""
@@ -65,9 +75,12 @@ MOST_STATES = 500_000
 """Largest number of states of a drawn path of wheels alone: every state of 1 h at 100 Hz, one in 0.1 s of 10 h."""
 
 
-@style.styled
-def trajectory(run: Run) -> Figure:
-    """Return fixes, filter, and odometry with final ICRs, momentary ICRs and without slip, over east and north [m]."""
+@styled
+def trajectory(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
+    """Return fixes, filter, and odometry with final ICRs, momentary ICRs and without slip, over east and north [m].
+
+    `ax`: axes to draw into, which are returned; by default the picture is a new figure.
+    """
     table = run.table
     every = -(-len(table) // MOST_STATES)
     odometries = odometry_icrs(table, run.track_width_m)
@@ -78,20 +91,22 @@ def trajectory(run: Run) -> Figure:
     norths, easts = np.column_stack(
         [np.maximum(np.min(lows, axis=0), low - detour), np.minimum(np.max(highs, axis=0), high + detour)]
     )
-    width_in = style.WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
+    width_in = style.WIDTH_IN - PATH_MARGINS_IN[0] - PATH_MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
     off = [f"{ODOMETRIES[name][1]} {distance_text(path.end_error_m)}" for name, path in paths.items()]
-    title = f"Wheels alone end off: {', '.join(off)}"
+    title = f"Wheels end off: {', '.join(off)}"
     subtitle = f"{run_title(run.document)}: {driven_text(run.document.drive)}"
-    height_in = box_in + MARGINS_IN[2] + MARGINS_IN[3]
-    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=MARGINS_IN)
-    axes = figure.subplots()
-    cell = look_down(axes, norths, easts, width_in / box_in, margin=0.04, ticks=9)
+    height_in = box_in + PATH_MARGINS_IN[2] + PATH_MARGINS_IN[3]
+    sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=PATH_MARGINS_IN)
+    axes = sheet.subplots()[0, 0]
+    cell = look_down(axes, norths, easts, margin=0.04, ticks=9)
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, style.FILTER, label="filter", zorder=4)
+    drawn = [(table.east_m, table.north_m)]
     pens = style.row_pens(row for row, *_ in ODOMETRIES.values())
     for name, path in paths.items():
+        drawn.append((path.east_m, path.north_m))
         (low, high), (row, _, order) = _corners(path), ODOMETRIES[name]
         pen = pens[row]
         leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
@@ -101,7 +116,6 @@ def trajectory(run: Run) -> Figure:
         ends_m = path.east_m[-1:].copy(), path.north_m[-1:].copy()
         axes.plot(*ends_m, marker="D", color=pen["color"], markersize=5.0, zorder=4.8)
     _draw_jumps(axes, run)
-    _draw_times(axes, run, cell)
     # Slip events: the filter's path through each, and a mark at its begin.
     for event in run.sensors.events:
         rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
@@ -111,9 +125,10 @@ def trajectory(run: Run) -> Figure:
             axes.plot(east[:1], north[:1], label="slip event", **SLIP_LOOK)
     axes.plot(table.east_m[:1], table.north_m[:1], zorder=5, label="start", **style.spot("white", 8.0))
     axes.plot(table.east_m[-1:], table.north_m[-1:], zorder=5, label="end", **style.spot("black", 6.0))
-    name_directions(axes)
-    style.add_legend(figure, ncols=2, columnspacing=3.0)
-    return figure
+    _write_times(axes, run, cell, drawn)
+    name_directions(axes, run.document)
+    sheet.legend(ncols=2, columnspacing=3.0)
+    return sheet.finished()
 
 
 def _corners(path: States | OdometryPath) -> Corners:
@@ -152,22 +167,24 @@ def _draw_jumps(axes: Axes, run: Run) -> None:
         axes.plot(east, north, label=f"jump, up to {error_text(largest[0].size_m)}{marked}", **JUMP_LOOK)
 
 
-def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
-    """Write the time at the filter's path at round intervals, where it does not cover another time."""
+def _write_times(axes: Axes, run: Run, cell_m: float, drawn: Sequence[tuple[Floats, Floats]]) -> None:
+    """Mark the filter's path at round intervals, and write the time where it covers no drawn path (east, north)."""
     table = run.table
     span = float(table.t_s[-1])
     every = next((step for step in TIME_STEPS_S if span / step <= MOST_TIMES), TIME_STEPS_S[-1])
     clear = TIME_CLEARANCE * cell_m * CELLS_A_VIEW
-    written = [np.array([table.east_m[0], table.north_m[0]]), np.array([table.east_m[-1], table.north_m[-1]])]
+    ends = [(float(table.east_m[row]), float(table.north_m[row])) for row in (0, -1)]
+    written, labels = list(ends), []
     for time in np.arange(every, span, every):
         row = int(np.searchsorted(table.t_s, time))
-        place = np.array([table.east_m[row], table.north_m[row]])
-        if min(float(np.hypot(*(place - other))) for other in written) > clear:
+        place = float(table.east_m[row]), float(table.north_m[row])
+        if min(math.dist(place, other) for other in written) > clear:
             written.append(place)
             text = f"{time:.0f} s" if every < 60 else f"{time / 60:.0f} min" if every < 3600 else f"{time / 3600:.0f} h"
-            axes.plot(*place, marker="|", color="black", markersize=7.0, zorder=4.7)
-            look: style.Look = {"fontsize": 7.0, "color": "0.25", "zorder": 4.9, "annotation_clip": True}
-            style.write_near(axes, text, (float(place[0]), float(place[1])), (3.0, 3.0), **look)
+            labels.append(Label(text, *place))
+    look: style.Look = {"marks": ends, "size_pt": TIME_PT, "farthest_pt": TIME_NEAR_PT, "color": "0.25"}
+    for _, *shown, _ in write_labels(axes, labels, drawn, **look):
+        axes.plot(*shown, marker="|", color="black", markersize=7.0, zorder=4.7)
 
 
 BOX_HEIGHT_IN = (2.4, 5.4)
@@ -189,12 +206,13 @@ def fitted_box_in(norths: Floats, easts: Floats, width_in: float) -> float:
     return float(np.clip(width_in * north / east, *BOX_HEIGHT_IN))
 
 
-def look_down(axes: Axes, norths: Floats, easts: Floats, shape: float, margin: float = 0.08, ticks: int = 5) -> float:
-    """Show all points (n,) [m] in axes `shape` times as wide as high, with a margin; return the side of a cell [m].
+def look_down(axes: Axes, norths: Floats, easts: Floats, margin: float = 0.08, ticks: int = 5) -> float:
+    """Show all points (n,) [m] with a margin and one scale for both directions; return the side of a cell [m].
 
     `ticks` is the approximate number of ticks on each axis; 0: none.
     """
     spans = float(np.ptp(norths)), float(np.ptp(easts))
+    shape = axes.bbox.width / axes.bbox.height
     height = (1 + 2 * margin) * max(spans[0], spans[1] / shape, SMALLEST_VIEW_M)
     for set_range, column, half in ((axes.set_ylim, norths, height / 2), (axes.set_xlim, easts, height * shape / 2)):
         middle = (float(column.min()) + float(column.max())) / 2
@@ -207,11 +225,18 @@ def look_down(axes: Axes, norths: Floats, easts: Floats, shape: float, margin: f
     return height * shape / CELLS_A_VIEW
 
 
-def name_directions(axes: Axes) -> None:
-    """Name the axes; for coordinates far from zero (UTM) the whole kilometres are in the name, not at each tick."""
+def name_directions(axes: Axes, document: RunDocument | None = None) -> None:
+    """Name the axes; for coordinates far from zero (UTM) the whole kilometres are in the name, not at each tick.
+
+    Parameters
+    ----------
+    document : of the run whose frame it is; a frame without datum has axes x and y and no known north. None: of a path
+        with east and north
+    """
     from matplotlib.ticker import ScalarFormatter
 
-    for name, axis, (lowest_m, _) in (("East", axes.xaxis, axes.get_xlim()), ("North", axes.yaxis, axes.get_ylim())):
+    across, up = direction_words(document)
+    for name, axis, (lowest_m, _) in ((across, axes.xaxis, axes.get_xlim()), (up, axes.yaxis, axes.get_ylim())):
         offset, counted_from = float(np.floor(lowest_m / 1000) * 1000), ""
         if abs(lowest_m) >= FAR_M:
             formatter = ScalarFormatter()

@@ -23,6 +23,7 @@ from icrtool.calibration.pooled import calibrated, turning_recording_of
 from icrtool.calibration.record import stored_calibration
 from icrtool.calibration.run_models import models_of
 from icrtool.errors import DataError
+from icrtool.estimation.convergence import icr_std_m
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, wrapped
 from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
@@ -42,6 +43,7 @@ from icrtool.records.dropout_document import DropoutDocument, FitDocument
 from icrtool.records.plain_data import Record
 from icrtool.records.rows import REST_OF_DRIVE, Row, rows_of, shown_rows
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, Run, track_of, width_or_usual_m
+from icrtool.records.run_document import IcrColumn
 
 MOST_PAGE_STEPS = 150_000
 """Largest number of wheel samples of a page. If there are more, a fixed number of samples is joined to one."""
@@ -138,7 +140,8 @@ def _steps_data(run: Run, rows: Ints, origin: tuple[float, float]) -> dict[str, 
 
 def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
     """Return the states that the time series show; each is a step too."""
-    table, icrs = run.table, {"y_right": "y_icr_right_m", "y_left": "y_icr_left_m", "x": "x_icr_m"}
+    table = run.table
+    icrs: dict[str, IcrColumn] = {"y_right": "y_icr_right_m", "y_left": "y_icr_left_m", "x": "x_icr_m"}
     values = {name: getattr(table, column)[steps] for name, column in icrs.items()}
     speeds = {"v_left": table.v_left_mps, "v_right": table.v_right_mps}
     rows = extremes(*(one[steps] for one in speeds.values()), *values.values(), points=SERIES_POINTS)
@@ -149,7 +152,7 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
         "heading": packed(wrapped(table.heading_rad[state])),
         **{name: packed(column[rows]) for name, column in values.items()},
         **{name: packed_levels(column[state]) for name, column in speeds.items()},
-        **{f"std_{name}": packed_levels(getattr(table, f"std_{column}")[state]) for name, column in icrs.items()},
+        **{f"std_{name}": packed_levels(icr_std_m(run, column)[state]) for name, column in icrs.items()},
     }
 
 

@@ -258,7 +258,7 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
     moments = [one.t_s for one in report.worst]
     worst = Table("lrrrrrrrl", rows[:1], head, caption, moments[:1])
     further = Table("lrrrrrrrl", rows[1:], head, "", moments[1:])
-    blocks: list[Block] = [worst, Section(f"The next {len(rows) - 1}", [further], PAGE), Figure(("worst",))]
+    blocks: list[Block] = [worst, Section(f"The next {len(rows) - 1}", [further], PAGE), Figure(("error_map", "worst"))]
     return Section("Worst cases", blocks, PAGE, name="worst")
 
 

@@ -47,14 +47,34 @@ def test_every_robot_of_a_fleet_has_its_name_in_the_key(tmp_path: Path) -> None:
         for draw in (fleet_icrs, fleet_errors):
             save_figure(draw(fleet), tmp_path / "fleet", ("png", "svg"))
     shown = [text.get_text().strip() for text in fleet_icrs(fleet).legends[0].get_texts()]
-    assert shown == [drawable(name, 24) for name in names]
+    assert sorted(shown) == sorted(drawable(name, 24) for name in names)
+
+
+def test_every_log_of_a_fleet_has_its_name_its_date_and_its_icrs_with_sigma() -> None:
+    points = [
+        FleetLog(
+            f"drive {day}", "runs", "done", robot="husky", start_utc=f"2025-10-{day:02d}T08:53:21Z",
+            icr={"y_icr_right_m": 0.5 + 0.01 * day, "y_icr_left_m": -0.5, "std_y_icr_right_m": 0.02,
+                 "std_y_icr_left_m": 0.03},
+        )
+        for day in (9, 2, 17)
+    ]  # fmt: skip
+    left, right = fleet_icrs(FleetNumbers("3 logs", points, {}, "")).axes
+    rows = [text.get_text() for text in left.get_yticklabels()]
+    assert rows == ["drive 2   2025-10-02", "drive 9   2025-10-09", "drive 17   2025-10-17"]
+    (bars,) = right.containers
+    ends = [segment[:, 0].tolist() for segment in bars.lines[2][0].get_segments()]
+    assert ends == [pytest.approx([at - 0.02, at + 0.02]) for at in (0.52, 0.59, 0.67)]
+    many = FleetNumbers("many", points * 20, {}, "")
+    assert fleet_icrs(many).axes[-1].get_xlabel() == "Date, UTC, 2025"
 
 
 def test_every_log_of_a_fleet_has_its_name_and_its_error() -> None:
     logs = {"barn": {"monday.bag": 0.31, "tuesday.bag": 0.62}, "yard": {"friday.bag": 1.25}}
-    (axes,) = fleet_errors(FleetNumbers("3 logs", [], logs, "recommended")).axes
+    starts = {"monday.bag": "2025-10-06T08:53:21Z", "friday.bag": ""}
+    (axes,) = fleet_errors(FleetNumbers("3 logs", [], logs, "recommended", starts)).axes
     names = [text.get_text() for text in axes.get_yticklabels()]
-    assert names == ["tuesday.bag", "monday.bag", "friday.bag"]
+    assert names == ["tuesday.bag", "monday.bag   2025-10-06", "friday.bag"]
     assert [text.get_text() for text in axes.texts] == ["0.620 m", "0.310 m", "1.25 m"]
     many = {"barn": {f"{number}.bag": 0.01 * (1 + number) for number in range(100)}}
     (axes,) = fleet_errors(FleetNumbers("100 logs", [], many, "recommended")).axes

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -18,6 +19,7 @@ from icrtool.calibration.run_models import models_of
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.report import DropoutReport, budget_distances
 from icrtool.dropout_analysis.shown_paths import (
+    errors_by_start,
     example_trials,
     force_outages,
     plan_outages,
@@ -26,8 +28,9 @@ from icrtool.dropout_analysis.shown_paths import (
 )
 from icrtool.output.figure_catalogue import draw_figures
 from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_histograms, dropout_summary
-from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
+from icrtool.output.figures.dropout_paths import dropout_examples, dropout_map, dropout_outages, dropout_worst
 from icrtool.output.figures.style import style
+from icrtool.output.text_format import error_text
 from icrtool.records.dropout_document import ModelResult, Outage
 from icrtool.records.run import Run
 from support.reports import with_content, with_models, with_numbers, with_outages
@@ -47,6 +50,7 @@ def outages(run: Run) -> tuple[Outage, ...]:
 
 def figures(run: Run, report: DropoutReport, outages: tuple[Outage, ...]) -> dict[str, Callable[[], Figure]]:
     whole = replace(report, outages=outages, examples=example_trials(run, 5.0), worst=worst_trials(run, horizon_m=2.0))
+    mapped = replace(whole, path_errors=errors_by_start(run, horizon_m=2.0).on_path)
     return {
         "summary": lambda: dropout_summary(whole),
         "histogram": lambda: dropout_histograms(with_rows(whole), 2.0, 5.0, 10.0),
@@ -55,10 +59,11 @@ def figures(run: Run, report: DropoutReport, outages: tuple[Outage, ...]) -> dic
         "examples": lambda: dropout_examples(whole),
         "worst": lambda: dropout_worst(whole),
         "outages": lambda: dropout_outages(whole),
+        "map": lambda: dropout_map(mapped),
     }
 
 
-NAMES = ["summary", "summary of all", "histogram", "histogram of all", "examples", "worst", "outages"]
+NAMES = ["summary", "summary of all", "histogram", "histogram of all", "examples", "worst", "outages", "map"]
 
 
 def drawn(draw: Callable[[], Figure]) -> Figure:
@@ -147,7 +152,8 @@ def test_the_summary_marks_the_distances_that_the_report_states(report: DropoutR
     shown = ("recommended", "controller", "calibration:season")
     assert sorted(written) == sorted(f"{reaches[name].distance_m:.1f} m" for name in shown)
     first = reaches["calibration:season"]
-    assert figure.texts[0].get_text() == f"calibration:season: within 0.1 m (95 %) for {first.short_text}"
+    stated = f"calibration:season: within 0.1 m (95 %) for {first.short_text}; next drive {first.next_text}"
+    assert figure.texts[0].get_text() == stated
     marks = [line.get_xydata()[0].tolist() for line in figure.axes[0].lines if line.get_marker() == "o"]
     assert sorted(marks) == sorted([reaches[name].distance_m, 0.1] for name in shown)
 
@@ -157,7 +163,7 @@ def test_the_summary_has_a_handful_of_entries_and_none_of_the_tables_alone(
 ) -> None:
     entries = texts_of(drawn(lambda: dropout_summary(with_outages(with_rows(report), outages))))
     entries = [text for text in entries if text]
-    assert len(entries) <= 7
+    assert len(entries) <= 10
     assert not any(text.startswith(("icr", "recommended_gyro", "icr_final")) for text in entries)
 
 
@@ -212,11 +218,12 @@ def test_a_report_draws_what_it_holds(
     run: Run, report: DropoutReport, outages: tuple[Outage, ...], tmp_path: Path
 ) -> None:
     examples = example_trials(run, 15.0)
+    report = replace(report, path_errors=errors_by_start(run, horizon_m=2.0).on_path)
     whole = with_content(report, examples=tuple(one.document for one in examples))
     whole = with_outages(replace(whole, examples=examples, worst=worst_trials(run)), outages)
     draw_figures("report", whole, tmp_path, ("png", "svg"))
     names = {path.stem for path in tmp_path.iterdir()}
-    assert names == {"summary", "histogram", "worst", "outages"}
+    assert names == {"summary", "histogram", "worst", "outages", "error_map"}
     assert len(list(tmp_path.iterdir())) == 2 * len(names)
     draw_figures("report", whole, tmp_path, ("png",), "all")
     further = {path.stem for path in tmp_path.iterdir()} - names
@@ -242,3 +249,62 @@ def test_an_outage_within_a_worst_trial_is_marked_there(
     for outage, marked in ((meanwhile, True), (before, False)):
         figure = drawn(lambda shown=outage: dropout_worst(replace(with_outages(report, (shown,)), worst=worst)))
         assert ("real outage" in {line.get_label() for line in figure.axes[1].lines}) is marked
+
+
+def test_the_map_colours_each_place_by_the_error_of_the_trial_that_starts_there(
+    run: Run, report: DropoutReport
+) -> None:
+    found, worst = errors_by_start(run, horizon_m=2.0), worst_trials(run, horizon_m=2.0)
+    axes = drawn(lambda: dropout_map(replace(report, path_errors=found.on_path, worst=worst))).axes[0]
+    (lines,) = (one for one in axes.collections if isinstance(one, LineCollection))
+    states = np.column_stack([run.table.east_m, run.table.north_m])
+    for segment, error in zip(lines.get_segments(), lines.get_array(), strict=True):
+        apart_m = np.hypot(*(states - segment.mean(axis=0)).T)
+        assert error in found.error_m[apart_m < 0.1]
+    assert lines.get_array().max() == pytest.approx(worst[0].document.errors_m["icr"], rel=1e-9)
+    (scale,) = axes.child_axes
+    assert scale.get_ylabel() == "Error after 2 m from there [m]"
+    grey = np.array([lines.cmap(step)[:3] for step in range(lines.cmap.N)]) @ (0.299, 0.587, 0.114)
+    assert (np.diff(grey) < -0.03).all()
+    assert f"1: {error_text(worst[0].document.errors_m['icr'])}" in [text.get_text() for text in axes.texts]
+
+
+def test_only_one_row_has_bands_and_the_others_have_bars(report: DropoutReport) -> None:
+    whole = with_rows(report)
+    (axes,) = drawn(lambda: dropout_summary(whole)).axes
+    first = whole.result("calibration:season")
+    assert first is not None
+    bands = {str(one.get_label()): one for one in axes.collections if one.get_label()[0] != "_"}
+    colours = {tuple(np.round(one.get_facecolor()[0][:3], 6)) for one in bands.values()}
+    assert set(bands) == {"its 95 % interval", "next drive, 9 of 10"}
+    assert len(colours) == 1
+    top = bands["its 95 % interval"].get_paths()[0].vertices
+    for horizon_m, high in zip(HORIZONS_M, first.column("p95_high_m"), strict=True):
+        if np.isfinite(high):
+            assert top[np.isclose(top[:, 0], horizon_m)][:, 1].max() == pytest.approx(high)
+    assert "other 95 % intervals" in texts_of(drawn(lambda: dropout_summary(whole)))
+
+
+def test_lines_are_straight_between_the_horizons_of_the_scale(report: DropoutReport) -> None:
+    whole = with_content(report, budgets=())
+    (axes,) = drawn(lambda: dropout_summary(whole)).axes
+    line = next(one for one in axes.lines if one.get_label() == "icr, 95 %")
+    assert line.get_xdata().tolist() == HORIZONS_M
+
+
+def test_a_band_that_ends_says_why(report: DropoutReport) -> None:
+    def ended(column: str, at: int) -> str:
+        numbers = {name: report.results[0].column(name).copy() for name in (column, "p95_low_m", "p95_high_m")}
+        for one in numbers.values():
+            one[at:] = np.nan
+        short = with_models(report, with_numbers(report.results[0], "icr", **numbers), *report.results[1:])
+        (axes,) = drawn(lambda: dropout_summary(with_content(short, budgets=()))).axes
+        return " ".join(text.get_text().replace("\n", " ").replace("\xa0", " ") for text in axes.texts)
+
+    assert ended("p95_high_m", 3) == "bands end at 5 m: too little path behind it for an interval"
+    assert ended("p95_m", 3).startswith("no trials beyond 5 m: ")
+
+
+def test_no_title_is_cut(run: Run, report: DropoutReport, outages: tuple[Outage, ...]) -> None:
+    for name, draw in figures(run, report, outages).items():
+        assert [text.get_text() for text in drawn(draw).texts if "…" in text.get_text()] == [], name

@@ -4,10 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import matplotlib as mpl
+import msgspec
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.filter_records import GATED
@@ -18,13 +20,23 @@ from icrtool.output.figures.style import new_figure, save_figure, style
 from icrtool.output.page.render import drawn_pictures
 from icrtool.pipeline import fit
 from icrtool.records.acceptance import CHOICE_HORIZON_M
-from icrtool.records.calibration_document import COMPARE_SCHEMA, ComparedGroup, GroupComparison, TransferCell
+from icrtool.records.calibration_document import (
+    COMPARE_SCHEMA,
+    ComparedGroup,
+    ComparedPair,
+    ErrorDifference,
+    GroupComparison,
+    TransferCell,
+)
 from icrtool.records.measurements import ReferenceJump
-from icrtool.records.run import Run
+from icrtool.records.run import ICR_COLUMNS, Run
 from support.barn import configured, simulate
 
 BAD_FIXES = 4
 NAMES = [name for name, entry in FIGURES.items() if entry.of == "run"]
+ESTIMATE_KEY = [
+    "estimate", "its ±1σ", "10 %", "90 %: converged", "no slip (±b/2, 0)", "no usable GNSS", "whole drive ±1σ"
+]  # fmt: skip
 CELL = 1 / 700
 """Two points closer than this part of the view are one dot."""
 
@@ -165,7 +177,8 @@ def test_trajectory_far_from_the_origin_keeps_short_ticks(make_run: Callable[...
     for column in (near.table.north_m, near.sensors.fixes.north_m):
         np.add(column, 5_412_300.0, out=column)
     (axes,) = drawn("trajectory", near).axes
-    assert axes.get_ylabel() == "North [m]  + 5,412,000 m"
+    assert axes.get_ylabel() == "y [m]  + 5,412,000 m"
+    assert axes.get_xlabel() == "x [m]"
     assert max(len(tick.get_text()) for tick in axes.get_yticklabels()) < 7
 
 
@@ -177,9 +190,7 @@ def test_odometry_that_leads_away_leaves_the_picture(make_run: Callable[..., Run
 
 def test_icr_estimates_show_bands_and_outage(run: Run) -> None:
     figure = drawn("icr_estimates", run)
-    assert legend_texts(figure) == [
-        "estimate", "±1σ", "10 %", "90 %: converged", "no slip (±b/2, 0)", "no usable GNSS"
-    ]  # fmt: skip
+    assert legend_texts(figure) == ESTIMATE_KEY
     rises = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
     assert len(rises) == 3
     assert all(rise.startswith("10–90 % in ") for rise in rises)
@@ -197,8 +208,7 @@ def test_icr_estimates_from_a_given_start_show_their_rises() -> None:
     )
     run = fit(simulate(), replace(config, filter=far))
     figure = drawn("icr_estimates", run)
-    texts = legend_texts(figure)
-    assert texts == ["estimate", "±1σ", "10 %", "90 %: converged", "no slip (±b/2, 0)", "no usable GNSS"]
+    assert legend_texts(figure) == ESTIMATE_KEY
     rises = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
     convergence = run.summary["icr"]["convergence_s"]
     assert rises == [
@@ -244,32 +254,88 @@ def test_line_styles_differ_in_grey() -> None:
     assert len({str(pen["linestyle"]) for pen in (FILTER, ICR, NO_SLIP_LINE)}) == 3
 
 
-def test_the_picture_of_a_comparison_answers_with_both_errors_and_its_words_stand_apart() -> None:
+def test_the_picture_of_a_comparison_shows_errors_and_differences_with_their_intervals() -> None:
     names = ["grass", "a very long name of a group", "asphalt"]
     cells = [
         TransferCell(CHOICE_HORIZON_M, 0.4 if row == column else 0.9, 0.1, 1.2, 0.3, 0.2, 0.4, calibrated_on=row,
                      tested_on=column, trials=3)
         for row in names for column in names
     ]  # fmt: skip
-    figure = transfer(
-        GroupComparison(
-            schema=COMPARE_SCHEMA, tool_version="", groups=dict.fromkeys(names, ComparedGroup("icr", (), {})), pairs=(),
-            transfer=tuple(cells), costs=tuple(one for one in cells if one.p95_m == 0.9),
-        )
-    )  # fmt: skip
-    figure.draw_without_rendering()
-    assert (
-        "0.900 m off after 10 m (95 %) with another's calibration, 0.400 m with its own" in figure.texts[0].get_text()
+    differences = [(1.0, 0.05, -0.1, 0.2), (CHOICE_HORIZON_M, 0.31, 0.12, 0.5), (20.0, 0.7, None, None)]
+    errors = tuple(
+        ErrorDifference(h, p95, low, high, p95, low, high, paired=False) for h, p95, low, high in differences
     )
-    matrix = figure.axes[0]
-    words = [*figure.texts, matrix.xaxis.label, *matrix.get_yticklabels()]
-    boxes = [(one.get_text(), one.get_window_extent()) for one in words]
-    columns = [(one.label2.get_text(), one.label2.get_window_extent()) for one in matrix.xaxis.get_major_ticks()]
+    found = GroupComparison(
+        schema=COMPARE_SCHEMA, tool_version="", groups=dict.fromkeys(names, ComparedGroup("icr", (), {})),
+        pairs=(ComparedPair("grass", "asphalt", (), errors, ""),), transfer=tuple(cells),
+        costs=tuple(one for one in cells if one.p95_m == 0.9),
+    )  # fmt: skip
+    figure = transfer(found)
+    figure.draw_without_rendering()
+    assert figure.texts[0].get_text() == "asphalt: +0.31 m against grass at 10 m (+0.12 to +0.50)"
+    own, more = figure.axes
+    assert [text.get_text() for text in own.get_yticklabels()][:2] == [
+        "grass, own calibration",
+        "grass, a ver… group's",
+    ]
+    drawn_at = {text.get_text(): row for row, text in enumerate(more.get_yticklabels())}
+    assert len(drawn_at) == len(differences) + 6
+    for horizon_m, p95, low, high in differences:
+        row = drawn_at[f"asphalt − grass, {horizon_m:g} m"]
+        assert any(row in line.get_ydata() and p95 in line.get_xdata() for line in more.lines)
+        bars = [path.vertices[:, 0].tolist() for bar in more.collections for path in bar.get_paths()
+                if row in path.vertices[:, 1]]  # fmt: skip
+        assert [np.round(bar, 9).tolist() for bar in bars] == ([] if low is None else [[low, high]])
+    assert legend_texts(figure) == ["with 95 % interval", "no interval: too little path", "may be chance: holds 0"]
+    written = [*figure.texts, *own.get_yticklabels(), *more.get_yticklabels()]
+    boxes = [(one.get_text(), one.get_window_extent()) for one in written]
     for number, (text, box) in enumerate(boxes):
         assert figure.bbox.contains(*box.min), text
-        # of the slanted names of the columns the boxes overlap, the words do not
-        for other, other_box in (*boxes[number + 1 :], *columns):
+        for other, other_box in boxes[number + 1 :]:
             assert not box.overlaps(other_box), f"{text!r} covers {other!r}"
+    same = found.pairs[0].errors[0]
+    chance = transfer(
+        msgspec.structs.replace(
+            found,
+            pairs=(ComparedPair("grass", "asphalt", (), (msgspec.structs.replace(same, horizon_m=10.0),), ""),),
+        )
+    )
+    assert chance.texts[0].get_text() == "No difference shown at 10 m: +0.05 m (−0.10 to +0.20)"
+
+
+def test_the_band_of_an_estimate_ends_at_the_sigma_of_the_text(run: Run) -> None:
+    panels = [axes for axes in drawn("icr_estimates", run).axes if axes.get_title(loc="right")]
+    for axes, column in zip(panels, ICR_COLUMNS, strict=True):
+        (band,) = (one for one in axes.collections if one.get_label() == "its ±1σ")
+        vertices = band.get_paths()[0].vertices
+        end = vertices[vertices[:, 0] == run.table.t_s[-1]][:, 1]
+        final, std = run.document.icr.final[column], run.document.icr.final_std[column]
+        assert end.max() - final == pytest.approx(std, rel=1e-9)
+        assert final - end.min() == pytest.approx(std, rel=1e-9)
+        value, reach = run.document.icr_of_drive(column)
+        (bar,) = (one for one in axes.containers if one.get_label() == "whole drive ±1σ")
+        ends = bar.lines[2][0].get_segments()[0][:, 1]
+        assert ends.tolist() == pytest.approx([value - reach, value + reach])
+
+
+def test_a_local_frame_has_x_and_y_and_no_gnss(make_run: Callable[..., Run]) -> None:
+    local = make_run(datum=False)
+    (axes,) = drawn("trajectory", local).axes
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
+    shown = [text.get_text() for name in NAMES for text in texts_of(drawn(name, local))]
+    assert "no usable position" in shown
+    assert [text for text in shown if any(word in text for word in ("GNSS", "North", "East"))] == []
+
+
+def test_the_path_has_no_boxes_behind_the_times_and_no_time_covers_it(run: Run) -> None:
+    (axes,) = drawn("trajectory", run).axes
+    times = [text for text in axes.texts if text.get_text().endswith(" s")]
+    assert len(times) > 3
+    path = axes.transData.transform(np.column_stack([run.table.east_m, run.table.north_m]))
+    for text in times:
+        assert text.get_bbox_patch() is None
+        box = Text.get_window_extent(text)
+        assert not ((path > box.min) & (path < box.max)).all(axis=1).any(), text
 
 
 def test_a_drive_that_shows_no_icrs_says_so_in_the_title(make_run: Callable[..., Run]) -> None:

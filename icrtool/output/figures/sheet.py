@@ -1,0 +1,169 @@
+"""Where a picture is drawn: in a figure of its own, or in axes of the caller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import wraps
+from typing import TYPE_CHECKING, Any, Concatenate, Literal, Protocol, TypeVar, cast, overload
+
+import numpy as np
+from matplotlib.transforms import ScaledTranslation
+from numpy.typing import NDArray
+
+from icrtool.kernels.arrays import Floats
+from icrtool.output.figures import style
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Subject_contra = TypeVar("Subject_contra", contravariant=True)
+
+Share = bool | Literal["all", "row", "col"]
+"""Which panels have one scale, as in ``matplotlib.figure.Figure.subplots``."""
+
+Grid = NDArray[Any]
+"""Axes (rows, columns)."""
+
+LABEL_BELOW_IN, LABEL_LEFT_IN = 0.33, 0.56
+"""Distance of the names of axes below and left of them [in]. Fixed distances save matplotlib two layouts of all
+ticks."""
+
+INSIDE_GAP = 0.12
+"""Gap between panels in the place of a caller's axes, as a share of its width and height."""
+
+INSIDE_KEY: style.Look = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 3, "fontsize": "small"}
+"""Legend below the panels in the place of a caller's axes."""
+
+
+class Drawing(Protocol[Subject_contra]):
+    """A function that draws a subject: into a new figure, or into axes of the caller."""
+
+    @overload
+    def __call__(self, subject: Subject_contra, /, *more: Any, ax: Axes, **named: Any) -> Axes: ...
+    @overload
+    def __call__(self, subject: Subject_contra, /, *more: Any, ax: None = None, **named: Any) -> Figure: ...
+
+
+def styled(draw: Callable[Concatenate[Subject_contra, ...], Figure | Axes]) -> Drawing[Subject_contra]:
+    """Return a function that draws a new figure in our style, and axes of the caller in the caller's style.
+
+    It has the keyword ``ax`` of `draw`. The settings of matplotlib are the same before and after a call.
+    """
+
+    @wraps(draw)
+    def drawn(subject: Subject_contra, *more: Any, ax: Axes | None = None, **named: Any) -> Figure | Axes:
+        if ax is not None:
+            return draw(subject, *more, ax=ax, **named)
+        with style.style():
+            return draw(subject, *more, **named)
+
+    return cast(Drawing[Subject_contra], drawn)
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """Where a picture is drawn.
+
+    Attributes
+    ----------
+    figure : holds the axes
+    ax : axes of the caller; None: `figure` has been made for this picture
+    panels : the axes that were drawn into
+    """
+
+    figure: Figure
+    ax: Axes | None = None
+    panels: list[Axes] = field(default_factory=list)
+
+    def subplots(
+        self, rows: int = 1, columns: int = 1, *, sharex: Share = False, sharey: Share = False,
+        width_ratios: Sequence[float] = (), height_ratios: Sequence[float] = (),
+    ) -> Grid:  # fmt: skip
+        """Return panels (rows, columns) in the figure, or in the place of the caller's axes."""
+        widths, heights = (
+            np.array(ratios or [1.0] * count, np.float64)
+            for ratios, count in ((width_ratios, columns), (height_ratios, rows))
+        )
+        if self.ax is None:
+            made = self.figure.subplots(
+                rows, columns, squeeze=False, sharex=sharex, sharey=sharey,
+                gridspec_kw={"width_ratios": widths.tolist(), "height_ratios": heights.tolist()},
+            )  # fmt: skip
+        elif (rows, columns) == (1, 1):
+            made = np.array([[self.ax]], object)
+        else:
+            made = self._inside(heights, widths, sharex=bool(sharex), sharey=bool(sharey))
+        self.panels.extend(made.ravel())
+        return made
+
+    def _inside(self, heights: Floats, widths: Floats, *, sharex: bool, sharey: bool) -> Grid:
+        """Return panels within the place of the caller's axes, which then show their title alone."""
+        ax = cast("Axes", self.ax)
+        ax.set_axis_off()
+        (left, width), (top, height) = _places(widths), _places(heights)
+        made = np.empty((len(heights), len(widths)), object)
+        for row, column in np.ndindex(*made.shape):
+            shared = {"sharex": made[0, column]} if sharex and row else {}
+            shared |= {"sharey": made[row, 0]} if sharey and column else {}
+            place = left[column], 1.0 - top[row] - height[row], width[column], height[row]
+            panel = made[row, column] = ax.inset_axes(place, **shared)
+            if sharex and row + 1 < len(heights):
+                panel.tick_params(labelbottom=False)
+        return made
+
+    def legend(self, **layout: Any) -> None:
+        """Add a legend with each label once: below all axes, or within the caller's axes."""
+        found: dict[str, Artist] = {}
+        for axes in self.panels:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                found.setdefault(str(label), handle)
+        if not found:
+            return
+        if self.ax is None:
+            legend = self.figure.legend(found.values(), found.keys(), **{"ncols": len(found)} | layout)
+        elif self.panels == [self.ax]:
+            legend = self.ax.legend(list(found.values()), list(found), loc="best", fontsize="small")
+        else:
+            legend = self.ax.legend(list(found.values()), list(found), **INSIDE_KEY)
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+
+    def finished(self) -> Figure | Axes:
+        """Return the caller's axes, or the figure with the names of its axes at fixed places."""
+        if self.ax is not None:
+            return self.ax
+        below = ScaledTranslation(0.0, -LABEL_BELOW_IN, self.figure.dpi_scale_trans)
+        left = ScaledTranslation(-LABEL_LEFT_IN, 0.0, self.figure.dpi_scale_trans)
+        for axes in self.panels:
+            axes.xaxis.set_label_coords(0.5, 0.0, axes.transAxes + below)
+            axes.yaxis.set_label_coords(0.0, 0.5, axes.transAxes + left)
+        return self.figure
+
+
+def _places(sizes: Floats) -> tuple[list[float], list[float]]:
+    """Return begins and lengths, as shares of a whole, of panels (n,) of relative sizes with gaps between them."""
+    lengths = sizes / sizes.sum() * (1.0 - INSIDE_GAP * (len(sizes) - 1))
+    begins = np.concatenate([[0.0], np.cumsum(lengths + INSIDE_GAP)[:-1]])
+    return begins.tolist(), lengths.tolist()
+
+
+def new_sheet(
+    title: str, subtitle: str, ax: Axes | None = None, *, height_in: float, width_in: float = style.WIDTH_IN,
+    margins_in: tuple[float, float, float, float] = style.MARGINS_IN, wspace: float = 0.2, hspace: float = 0.2,
+) -> Sheet:  # fmt: skip
+    """Return the place of a picture: `ax`, with its title, or a new figure.
+
+    Parameters
+    ----------
+    title, subtitle : as in `icrtool.output.figures.style.new_figure`; `ax` gets the title alone
+    ax : axes of the caller; None: a new figure, for which the following parameters hold
+    height_in, width_in, margins_in, wspace, hspace : as in `new_figure`
+    """
+    if ax is None:
+        layout = {"height_in": height_in, "width_in": width_in, "wspace": wspace, "hspace": hspace}
+        return Sheet(style.new_figure(title, subtitle, margins_in=margins_in, **layout))
+    ax.set_title(style.drawable(title), loc="left", parse_math=False, wrap=True)
+    return Sheet(cast("Figure", ax.get_figure(root=True)), ax)
