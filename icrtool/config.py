@@ -67,6 +67,8 @@ class TopicsConfig:
     wheels: str | None = None
     wheel_left: str | None = None
     wheel_right: str | None = None
+    twist_speed: str | None = None
+    twist_turn: str | None = None
     gnss: str | None = None
     heading: str | None = None
     clock: Literal["auto", "header", "log"] = "auto"
@@ -77,6 +79,17 @@ class TopicsConfig:
             raise ValueError("wheel_left: one side alone; wheel_left and wheel_right come together")
         if self.wheels is not None and self.wheel_left is not None:
             raise ValueError("wheels: the wheels are named twice; give it, or wheel_left and wheel_right")
+        if (self.twist_speed is None) != (self.twist_turn is None):
+            raise ValueError("twist_speed: one part alone; twist_speed and twist_turn come together")
+        if self.twist_speed is not None and (self.wheels is not None or self.wheel_left is not None):
+            raise ValueError("twist_speed: the wheels are named twice; give twist_speed and twist_turn, or the wheels")
+
+    @property
+    def fields_of_wheels(self) -> dict[str, str]:
+        """The fields that are named as wheels, by key: of both sides, or of a body twist; empty without any."""
+        keys = ("wheel_left", "wheel_right") if self.wheel_left is not None else ("twist_speed", "twist_turn")
+        named = {key: getattr(self, key) for key in keys}
+        return {} if None in named.values() else named
 
 
 @dataclass(frozen=True, slots=True)

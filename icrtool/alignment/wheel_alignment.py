@@ -62,7 +62,13 @@ CONTRADICTED_SIGMAS, CONTRADICTED_SHARE = 3.0, 0.5
 deviations, and as a share of the wheels' distance, because speed and turn vary within a gap. Both must be exceeded."""
 
 FUSED_CORRELATION = 0.9995
-"""Correlation of the turn rates of wheels and gyro above which the former was computed from the latter."""
+"""Correlation of the turn rates of wheels and gyro above which the former may have been computed from the latter."""
+
+FUSED_SLOPE = 0.003
+"""Difference from 1 of the ratio of their turns that the interpolation between stamps may cause."""
+
+SHARED_NOISE = 0.9
+"""Correlation of the second differences of both rates, which are mostly noise, of a copied rate."""
 
 
 def configured_scales(config: Config) -> tuple[float, float]:
@@ -200,7 +206,7 @@ def align_wheels(
         ground_change_s=None if change is None else change.t_s,
     )
     notes += [] if change is None else [note("ground_changed", change.text)]
-    return facts, applied, [*notes, *_fused_note(log)]
+    return facts, applied, [*notes, *_fused_note(log, config.wheels.twist_width_m or config.robot.track_width_m)]
 
 
 def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
@@ -266,17 +272,30 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
     return (factor * (1.0 + difference / 2), factor * (1.0 - difference / 2)), notes
 
 
-def _fused_note(log: RobotLog) -> list[Note]:
-    """Return a warning for wheels that are another filter's output: their turn rate is the gyro's."""
+def _fused_note(log: RobotLog, width_m: float | None) -> list[Note]:
+    """Return a warning for wheels that are another filter's output: their turn rate is the gyro's.
+
+    A copy of the gyro's rate turns by 1 of it, and has its noise. Wheels that slip by 1 % turn by 1.01 of it.
+    `width_m` is the width that the body twist was converted with.
+    """
     stream = next((one for one in log.streams if one.is_twist), None)
-    if stream is None or log.gyro is None:
+    if stream is None or log.gyro is None or width_m is None:
         return []
     t = (log.wheels.stamp_ns - log.gyro.stamp_ns[0]) / 1e9
     rate = np.interp(t, (log.gyro.stamp_ns - log.gyro.stamp_ns[0]) / 1e9, log.gyro.rate_radps)
-    apart = log.wheels.v_left_mps - log.wheels.v_right_mps
-    if not (np.ptp(rate) > 0.1 and np.ptp(apart) > 0 and float(np.corrcoef(rate, apart)[0, 1]) > FUSED_CORRELATION):
+    turn = (log.wheels.v_left_mps - log.wheels.v_right_mps) / width_m
+    if not (np.ptp(rate) > 0.1 and np.ptp(turn) > 0 and float(np.corrcoef(rate, turn)[0, 1]) > FUSED_CORRELATION):
         return []
-    fact = f"{stream.topic} turns exactly as the gyro does: it is fused, not measured by wheels, and shows no slip"
+    varies = float(rate.std())
+    of_gyro = float(np.cov(rate, turn, bias=True)[0, 1]) / varies**2
+    std = float((turn - turn.mean() - of_gyro * (rate - rate.mean())).std()) / (varies * math.sqrt(len(rate)))
+    if abs(abs(of_gyro) - 1.0) > max(FUSED_SLOPE, EVIDENCE_SIGMAS * std):
+        return []
+    noise, shared = np.diff(rate, 2), np.diff(turn, 2)
+    if not (noise.any() and shared.any() and abs(float(np.corrcoef(noise, shared)[0, 1])) > SHARED_NOISE):
+        return []
+    ratio = f"{abs(of_gyro):.4f} ± {max(std, 0.0001):.4f} of the gyro's turns"
+    fact = f"{stream.topic} turns by {ratio}, with the same noise: it is fused with a gyro, or does not slip at all"
     return [note("wheels_fused", f"{fact}; name the wheels' own topic with topics.wheels")]
 
 

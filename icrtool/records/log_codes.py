@@ -71,6 +71,18 @@ OF_FILES: dict[str, Explanation] = {
         "Their stamps are spread over the time since the packet before.",
         "Have the driver stamp each sample when it is measured.",
     ),
+    "fix_bursts": Explanation(
+        "info",
+        "Positions share stamps or arrive several at a time: whole seconds, a serial adapter or a radio link.",
+        "Their stamps are spread over the time since the ones before; the delay of the position is estimated as usual.",
+        "Have the driver stamp each position when it is measured.",
+    ),
+    "datum_far": Explanation(
+        "warning",
+        "The configured origin of the local plane is far from the fixes, and the plane is turned there.",
+        "The first fix is the origin instead; north and east count from there.",
+        "Correct `frames.datum`: latitude first, then longitude, in degrees, west and south negative.",
+    ),
     "wheel_positions_restart": Explanation(
         "warning",
         "Positions of the wheels begin again: the base restarted, or lost its counts.",

@@ -195,6 +195,10 @@ Its turn rate is the difference of the sides over the width that the controller 
 """
 
 
+OWN_TWIST = " (body twist)"
+"""End of the message type of wheels that were read from the named fields of a body twist."""
+
+
 @dataclass(frozen=True, slots=True)
 class StreamChoice:
     """Which topic feeds a role, and why.
@@ -224,6 +228,8 @@ class StreamChoice:
     @property
     def is_twist(self) -> bool:
         """Whether the wheels' speeds were made of a body twist; a pair of topics or fields holds speeds of its own."""
+        if self.message_type.endswith(OWN_TWIST):
+            return self.role == "wheels"
         return self.role == "wheels" and self.message_type in TWIST_TYPES and " + " not in self.topic
 
 

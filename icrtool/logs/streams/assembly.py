@@ -16,7 +16,7 @@ from icrtool.errors import ConfigError, DataError, LogError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import DISORDER_NS, TopicTable
-from icrtool.logs.streams.bursts import spread_bursts
+from icrtool.logs.streams.bursts import spread_bursts, spread_positions
 from icrtool.logs.streams.gyro_units import DEGREE, is_in_degrees, is_too_fast
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE, find_gyro, inertial_units
 from icrtool.logs.streams.positions import antenna_place
@@ -129,6 +129,12 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         far = "one stream has no header stamps, and the header stamps of another are far from log time"
         notes.append(note("log_time_used", f"{far}; log time is used for all streams"))
     notes += clock_notes([(role, one.stamps) for role, one in chosen.items()], name)
+    spread, of_bursts = _spread(position, clock)
+    notes += of_bursts
+    if source is not None and source.topic == position.topic:
+        source = replace(source, stamps=spread)
+    position = replace(position, stamps=spread)
+    notes += _far_datum(position, config)
     gnss, datum = _fixes(position, config, clock)
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock)
     wheels, wheel_notes = wheel_samples(motion, motion.stamps.on(clock), config, name)
@@ -295,7 +301,8 @@ def _fixes(
             apart = np.abs(latitude - np.median(latitude)) + np.abs(longitude - np.median(longitude))
             row = int(np.argmax(apart < FAR_DEG)) if (apart < FAR_DEG).any() else 0
             first = float(latitude[row]), float(longitude[row])
-            datum = Datum(*(config.frames.datum or first), float(height[0]))
+            given_datum = None if _far_datum(source, config) else config.frames.datum
+            datum = Datum(*(given_datum or first), float(height[0]))
         origin = datum.latitude_deg, datum.longitude_deg, datum.height_m
         north, east, _ = geodetic2ned(latitude, longitude, height, *origin)
     else:
@@ -305,6 +312,58 @@ def _fixes(
     )
     stated = None if source.stated_class is None else source.stated_class[rows]
     return PositionFixes(stamps[rows], north, east, var_north, var_east, covariance, stated), datum
+
+
+FAR_TURN_RAD, FAR_M = math.radians(0.5), 285e3
+"""Turn of a local plane at the fixes, and distance, above which its origin is too far away [rad, m]. At this distance
+the plane is 0.1 % too small; a smaller turn is found and corrected with the heading."""
+
+EARTH_RADIUS_M = 6_371_000.0
+"""Mean radius of the earth [m]."""
+
+
+def _far_datum(source: PositionSource, config: Config) -> list[Note]:
+    """Return a note where the configured origin is too far from the fixes for one plane; none where it is near.
+
+    Notes
+    -----
+    Distance on the sphere by the haversine formula; north turns by the difference of the longitudes times the sine of
+    the latitude (Snyder 1987, Map Projections).
+    """
+    if config.frames.datum is None or source.geodetic is None:
+        return []
+    latitude, longitude = np.median(source.geodetic[source.usable, :2], axis=0).tolist()
+    (lat, lon), (lat_0, lon_0) = np.radians([(latitude, longitude), config.frames.datum]).tolist()
+    apart = math.remainder(lon - lon_0, 2.0 * math.pi)
+    turn, middle = apart * math.sin((lat + lat_0) / 2), math.cos(lat) * math.cos(lat_0) * math.sin(apart / 2) ** 2
+    far_m = 2.0 * EARTH_RADIUS_M * math.asin(min(math.sqrt(math.sin((lat - lat_0) / 2) ** 2 + middle), 1.0))
+    if abs(turn) <= FAR_TURN_RAD and far_m <= FAR_M:
+        return []
+    what = f"frames.datum lies {far_m / 1e3:,.0f} km from the fixes ({latitude:.4f}, {longitude:.4f})"
+    plane = f"its local plane is turned by {abs(math.degrees(turn)):.1f}° there"
+    why = f"{what}, and {plane}: the first fix is the datum instead; correct frames.datum, [latitude, longitude]"
+    return [note("datum_far", why)]
+
+
+def _spread(source: PositionSource, clock: Clock) -> tuple[StampedRows, list[Note]]:
+    """Return the stamps of positions, spread where they arrive several at a time or share a stamp, and what was found.
+
+    Rows that are not used keep their stamps.
+    """
+    rows, stamps = np.flatnonzero(source.usable), source.stamps.on(clock)
+    if source.geodetic is not None:
+        latitude, longitude, _ = np.radians(source.geodetic[rows]).T
+        place = EARTH_RADIUS_M * (latitude + 1j * longitude * np.cos(latitude))
+    else:
+        place = np.asarray(source.metric, np.float64)[rows] @ np.array([1.0, 1j])
+    by_header = clock == "header" and source.stamps.header_ns is not None
+    bursts = spread_positions(stamps[rows], place, measured=by_header)
+    if not (text := bursts.note("fixes" if source.geodetic is not None else "poses")):
+        return source.stamps, []
+    spread = stamps.copy()
+    spread[rows] = bursts.stamp_ns
+    changed = replace(source.stamps, header_ns=spread) if by_header else replace(source.stamps, log_ns=spread)
+    return changed, [note("fix_bursts", f"{source.topic}: {text}")]
 
 
 def _headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[HeadingSamples, str]:
@@ -346,7 +405,8 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
     if not _is_doubled(stamps, left, right):
         bursts = spread_bursts(stamps)
         stamps = bursts.stamp_ns
-        notes += [note("wheel_bursts", f"{topic}: {bursts.note}")] if bursts.note else []
+        text = bursts.note("wheel samples")
+        notes += [note("wheel_bursts", f"{topic}: {text}")] if text else []
     rows, backwards, dropped = increasing(stamps)
     if backwards:
         notes.append(note("rows_sorted", f"{topic}: {backwards} wheel stamps go back; sorted"))

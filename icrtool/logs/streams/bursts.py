@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Ints
+from icrtool.kernels.arrays import Complexes, Ints
 
 SHORT_INTERVAL = 0.2
 """Part of the mean interval. Samples that arrive closer together than this are of one packet: no sensor that samples
@@ -30,18 +30,22 @@ class Bursts(NamedTuple):
     stamp_ns : (n,) as they were given where `samples` is 0
     samples : median number of samples of a packet, of those with more than one; 0 where there are none
     apart_ns : median interval between these packets
+    shared : the samples of a packet have one stamp, as a clock of whole seconds gives: it is the time of the first one
     """
 
     stamp_ns: Ints
     samples: int
     apart_ns: int
+    shared: bool = False
 
-    @property
-    def note(self) -> str:
-        """What was found and done, as a sentence; empty without bursts."""
+    def note(self, of: str) -> str:
+        """Return what was found of samples and done, as a sentence; empty without bursts."""
         if not self.samples:
             return ""
-        found = f"wheel samples arrive in bursts of {self.samples}, {self.apart_ns / 1e6:.0f} ms apart"
+        if self.shared:
+            found = f"{of} share their stamps, {self.samples} at a time, {self.apart_ns / 1e6:.0f} ms apart"
+            return f"{found}: the stamps are spread over the time until the next ones"
+        found = f"{of} arrive in bursts of {self.samples}, {self.apart_ns / 1e6:.0f} ms apart"
         return f"{found}: the stamps of each burst are spread over the time since the one before"
 
 
@@ -76,3 +80,34 @@ def spread_bursts(stamp_ns: Ints) -> Bursts:
     spread[order] = stamps[ends][packet] - np.rint(before * step[packet]).astype(np.int64)
     many = count > 1
     return Bursts(spread, int(np.median(count[many])), int(np.median(since[many])))
+
+
+EVEN_STEP = 0.5
+"""Mean step of the position within a packet, as a share of the step from packet to packet, above which the positions of
+a packet were measured one after another: it is 1 for an even rate, and 0 for repeated or truly close ones."""
+
+LARGEST_STEPS = 0.95
+"""Quantile of the steps of the position, to which larger ones are limited: jumps, and steps over gaps."""
+
+
+def spread_positions(stamp_ns: Ints, place: Complexes, *, measured: bool) -> Bursts:
+    """Return stamps (n,) of positions in any order, spread where the positions move on within the packets.
+
+    Parameters
+    ----------
+    place : (n,) positions in one plane [m]
+    measured : the stamps are of the measurements, not of their arrival: those that are equal were rounded down
+    """
+    found = spread_bursts(stamp_ns)
+    if not found.samples:
+        return found
+    order = np.argsort(found.stamp_ns, kind="stable")
+    step = np.abs(np.diff(place[order]))
+    step = np.minimum(step, np.quantile(step, LARGEST_STEPS))
+    within = np.diff(found.stamp_ns[order]) > np.diff(np.sort(stamp_ns))
+    if not (within.any() and (~within).any() and step[within].mean() > EVEN_STEP * step[~within].mean()):
+        return Bursts(stamp_ns, 0, 0)
+    if measured and float((np.diff(np.sort(stamp_ns))[within] == 0).mean()) > EVEN_STEP:
+        later = found.apart_ns - found.apart_ns // found.samples
+        return found._replace(stamp_ns=found.stamp_ns + later, shared=True)
+    return found

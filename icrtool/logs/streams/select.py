@@ -30,7 +30,7 @@ Kind = TypeVar("Kind", WheelSource, PositionSource, HeadingSource)
 
 NEEDS: dict[Role, str] = {
     "wheels": "wheel joints, encoders, motor feedback, wheel odometry or a twist; of messages of other types "
-    "topics.wheel_left and wheel_right name the fields (/topic.field)",
+    "topics.wheel_left and wheel_right name the fields (/topic.field), of a body twist twist_speed and twist_turn",
     "gnss": "a GNSS fix, or a pose of a reference (total station, lidar, motion capture)",
     "heading": "an orientation (AHRS), a compass or a dual antenna heading",
 }
@@ -99,7 +99,9 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
         paths = sorted(sides[channel.id])
         for role in ROLE_WORDS:
             row = MESSAGE_TYPES[role].get(channel.message_type)
-            is_open = getattr(topics, role) in (None, channel.topic) and (role != "wheels" or topics.wheel_left is None)
+            is_open = getattr(topics, role) in (None, channel.topic) and (
+                role != "wheels" or not topics.fields_of_wheels
+            )
             paths += row.fields if row is not None and is_open else ()
         if channel.message_type == GYRO_TYPE:
             paths += GYRO_AXES
@@ -123,7 +125,7 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
     topics = config.topics
     # the wheels first: their memory, the largest, is then free for the others
     wheels = pair_candidates(tables, config)
-    if topics.wheel_left is None:
+    if not topics.fields_of_wheels:
         wheels = _read_all(tables, "wheels", config, WheelSource) + wheels
     others_read = MESSAGE_TYPES["gnss"].keys() | MESSAGE_TYPES["heading"].keys()
     drop_used_columns([table for table in tables if table.message_type not in others_read])
@@ -226,9 +228,9 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
     """
     topics = config.topics
     named = topics.wheels
-    if topics.wheel_left is not None and topics.wheel_right is not None:
-        _check_sides({"left": topics.wheel_left, "right": topics.wheel_right}, found, log, channels)
-        named = f"{topics.wheel_left} + {topics.wheel_right}"
+    if sides := topics.fields_of_wheels:
+        _check_sides(sides, found, log, channels)
+        named = " + ".join(sides.values())
     wheels = _chosen(found.wheels, named)
     check_joints(wheels, found.wheels, config)
     _check_roles(topics, found, log, channels)
@@ -271,9 +273,9 @@ def other_references(found: Candidates, choice: Choice, config: Config) -> tuple
 
 
 def _check_sides(sides: Mapping[str, str], found: Candidates, log: str, channels: Sequence[Channel]) -> None:
-    """Refuse a configured pair of wheels, by side, that the log does not have or that cannot be used."""
+    """Refuse a configured pair of fields, by key, that the log does not have or that cannot be used."""
     for side, name in sides.items():
-        key, topic = f"topics.wheel_{side}", topic_of_side(name)
+        key, topic = f"topics.{side}", topic_of_side(name)
         needed = f"name the field of one side as {topic}.left or {topic}.data[0]"
         if (kind := _type_in(log, channels, found.unread, key, topic)) not in PAIR_TYPES and topic == name:
             raise ConfigError(key, f"{topic}: {kind} is not the number of one side", needed)
@@ -281,7 +283,7 @@ def _check_sides(sides: Mapping[str, str], found: Candidates, log: str, channels
             raise ConfigError(key, f"{topic}: {found.unread[topic]}", needed)
     if found.wheels and found.wheels[0].is_empty:
         why = f"{found.wheels[0].topic}: {found.wheels[0].problem}"
-        raise ConfigError("topics.wheel_left", why, "name another pair")
+        raise ConfigError(f"topics.{next(iter(sides))}", why, "name another pair")
 
 
 def _check_roles(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:

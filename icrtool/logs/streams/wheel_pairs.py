@@ -25,7 +25,7 @@ from icrtool.logs.streams.message_types import KNOWN_TYPES
 from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, share_clock, stamp_rows
 from icrtool.logs.streams.wheels import COMMAND_NOTES, COMMANDED, COMMANDED_PENALTY, MOST_WHEELS, WHEEL_WORDS, elements
 from icrtool.records.notes import note
-from icrtool.records.samples import WheelUnit
+from icrtool.records.samples import OWN_TWIST, WheelUnit
 from icrtool.records.text import LogText
 
 _NUMBERS = ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32", "UInt64")
@@ -159,8 +159,8 @@ def _name(topic: str, path: str) -> str:
 def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, set[str]]:
     """Return, by channel id, the fields that may be one side, or that hold all wheels."""
     found: dict[int, set[str]] = {channel.id: set() for channel in channels}
-    if topics.wheel_left is not None and topics.wheel_right is not None:
-        for topic, _, path in (topics.wheel_left.partition("."), topics.wheel_right.partition(".")):
+    if named := topics.fields_of_wheels:
+        for topic, _, path in (name.partition(".") for name in named.values()):
             for channel in channels:
                 if channel.topic == topic:
                     found[channel.id].add(elements(path or "data")[0])
@@ -256,11 +256,12 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
 def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelSource]:
     """Return the wheels made of two sides: the configured ones, or all that the names of topics and fields show."""
     topics = config.topics
-    if topics.wheel_left is not None and topics.wheel_right is not None:
+    if given := topics.fields_of_wheels:
         by_topic: dict[str, TopicTable] = {table.topic: table for table in tables}
-        named = (name.partition(".") for name in (topics.wheel_left, topics.wheel_right))
+        named = (name.partition(".") for name in given.values())
         sides = [Side(by_topic[topic], path or "data") for topic, _, path in named if topic in by_topic]
-        return [pair_motion(sides[0], sides[1], config)] if len(sides) == 2 else []
+        motion = twist_motion if "twist_speed" in given else pair_motion
+        return [motion(sides[0], sides[1], config)] if len(sides) == 2 else []
     found: dict[str, dict[str, Side]] = {}
     for table in tables:
         if table.message_type in KNOWN_TYPES or topics.wheels not in (None, table.topic):
@@ -349,6 +350,16 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
         topic=topic, message_type=kind, stamps=stamps, position=position, speed=speed, unit=unit, score=score, why=why,
         notes=notes,
     )  # fmt: skip
+
+
+def twist_motion(speed: Side, turn: Side, config: Config) -> WheelSource:
+    """Return the body twist of two fields, forward speed [m/s] and turn rate [rad/s], at the stamps of the speed."""
+    found = pair_motion(speed, turn, replace(config, wheels=replace(config.wheels, quantity="velocity")))
+    if found.speed is None:
+        return found
+    kind = LogText(f"{LogText(found.message_type).raw}{OWN_TWIST}")
+    why = "speed and turn rate of the body in fields of its own"
+    return replace(found, message_type=kind, twist=np.column_stack(found.speed), speed=None, why=why)
 
 
 def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, Ints, Ints]:

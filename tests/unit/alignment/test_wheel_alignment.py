@@ -224,6 +224,21 @@ def test_fused_odometry_offered_as_wheels_is_reported(message_type: str, share: 
     assert any("it is fused" in warning and "topics.wheels" in warning for warning in warnings) == warned
 
 
+@pytest.mark.parametrize(("slip", "noise_radps"), [(1.01, 0.0), (1.01, 0.002), (1.0, 0.002), (0.99, 0.0)])
+def test_wheels_that_slip_a_little_are_not_called_fused(slip: float, noise_radps: float) -> None:
+    """Their turns correlate with a good gyro by more than 0.9995, but are not 1 of it, or lack its noise."""
+    log, rng = make_log(seconds=120.0, heading_std_deg=0.0), np.random.default_rng(0)
+    speed = (log.wheels.v_left_mps + log.wheels.v_right_mps) / 2
+    rate = np.gradient(np.unwrap(log.heading.heading_rad), 0.02)
+    streams = tuple(replace(stream, message_type="nav_msgs/Odometry") for stream in log.streams)
+    gyro = GyroSamples("/imu", log.wheels.stamp_ns, rate + rng.normal(0.0, noise_radps, len(rate)))
+    width = CONFIG.robot.track_width_m
+    assert width is not None
+    sides = (speed + sign * slip * rate * width / 2 for sign in (1, -1))
+    slipping = replace(with_wheels(log, *sides), streams=streams, gyro=gyro)
+    assert not [one for one in align_streams(slipping, CONFIG).notes if one.code == "wheels_fused"]
+
+
 def test_the_diameter_for_the_radius_is_corrected_on_wheels_that_roll_at_less_than_their_radius_too() -> None:
     log = make_log(seconds=120.0)
     left, right = (2.0 / 0.955 * speed for speed in (log.wheels.left, log.wheels.right))

@@ -19,8 +19,10 @@ from support.field_logs import (
     Drive,
     Message,
     fixes,
+    header,
     imus,
     joint_states,
+    made,
     make_drive,
     numbers,
     write_messages,
@@ -140,3 +142,46 @@ def test_a_table_is_read_with_any_usual_separator_and_decimal_sign(
     named = [one for one in log.notes if one.code == "table_form"]
     assert len(named) == (separator != ",")
     assert all(("decimal comma" in one.text) == (decimal == ",") for one in named)
+
+
+KEYS_OF_TWIST = ("topics.twist_speed=/base/state.accel.linear.x", "topics.twist_turn=/base/state.accel.angular.z")
+
+
+def own_twists(drive: Drive, width_m: float) -> Iterator[Message]:
+    """Yield a body twist in fields of a type that is none."""
+    kind = "geometry_msgs/msg/AccelStamped"
+    speed = (drive.left_radps + drive.right_radps) / 2 * RADIUS_M
+    turn = (drive.right_radps - drive.left_radps) * RADIUS_M / width_m
+    for stamp_ns, v, w in zip(drive.stamp_ns.tolist(), speed.tolist(), turn.tolist(), strict=True):
+        parts = {"linear": {"x": v}, "angular": {"z": w}}
+        fields = {name: made("geometry_msgs/msg/Vector3", **part) for name, part in parts.items()}
+        content = made(kind, header=header(stamp_ns), accel=made("geometry_msgs/msg/Accel", **fields))
+        yield Message(stamp_ns, "/base/state", kind, content)
+
+
+def test_a_body_twist_in_fields_that_are_named_gives_the_wheels(tmp_path: Path) -> None:
+    path = write_messages(tmp_path / "log.mcap", own_twists(DRIVE, 1.0), fixes(DRIVE), imus(DRIVE))
+    config = load_config(sets=(*ROBOT, *KEYS_OF_TWIST, "wheels.twist_width_m=1.0"))
+    log = read_log(path, config)
+    np.testing.assert_allclose(log.wheels.v_left_mps, DRIVE.left_radps * RADIUS_M, atol=1e-12)
+    np.testing.assert_allclose(log.wheels.v_right_mps, DRIVE.right_radps * RADIUS_M, atol=1e-12)
+    (stream,) = (one for one in log.streams if one.role == "wheels")
+    assert stream.is_twist
+    assert stream.topic == "/base/state.accel.linear.x + /base/state.accel.angular.z"
+
+
+@pytest.mark.parametrize(
+    ("sets", "words"),
+    [
+        (KEYS_OF_TWIST[:1], r"topics.twist_speed: one part alone"),
+        ((*KEYS_OF_TWIST, "topics.wheels=/joint_states"), r"topics.twist_speed: the wheels are named twice"),
+        ((KEYS_OF_TWIST[0], "topics.twist_turn=/none.z"), r"topics.twist_turn: /none is not in"),
+        ((KEYS_OF_TWIST[0], "topics.twist_turn=/base/state.accel.z"), r"has no numbers accel.z"),
+    ],
+)
+def test_a_wrong_field_of_a_body_twist_is_refused_with_its_key(
+    tmp_path: Path, sets: tuple[str, ...], words: str
+) -> None:
+    path = write_messages(tmp_path / "log.mcap", own_twists(DRIVE, 1.0), fixes(DRIVE), imus(DRIVE))
+    with pytest.raises(ConfigError, match=words):
+        read_log(path, load_config(sets=(*ROBOT, *sets)))
