@@ -358,7 +358,7 @@ def _spread(source: PositionSource, clock: Clock) -> tuple[StampedRows, list[Not
         place = np.asarray(source.metric, np.float64)[rows] @ np.array([1.0, 1j])
     by_header = clock == "header" and source.stamps.header_ns is not None
     bursts = spread_positions(stamps[rows], place, measured=by_header)
-    if not (text := bursts.note("fixes" if source.geodetic is not None else "poses")):
+    if not (text := bursts.sentence("fixes" if source.geodetic is not None else "poses")):
         return source.stamps, []
     spread = stamps.copy()
     spread[rows] = bursts.stamp_ns
@@ -405,7 +405,7 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
     if not _is_doubled(stamps, left, right):
         bursts = spread_bursts(stamps)
         stamps = bursts.stamp_ns
-        text = bursts.note("wheel samples")
+        text = bursts.sentence("wheel samples")
         notes += [note("wheel_bursts", f"{topic}: {text}")] if text else []
     rows, backwards, dropped = increasing(stamps)
     if backwards:

@@ -38,7 +38,7 @@ class Bursts(NamedTuple):
     apart_ns: int
     shared: bool = False
 
-    def note(self, of: str) -> str:
+    def sentence(self, of: str) -> str:
         """Return what was found of samples and done, as a sentence; empty without bursts."""
         if not self.samples:
             return ""

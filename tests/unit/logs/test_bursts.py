@@ -40,7 +40,7 @@ def test_stamps_of_packets_are_spread_as_they_were_measured(samples: int, apart_
     found = spread_bursts(packets(stamps, samples, apart_ns))
     assert found.samples == samples
     np.testing.assert_allclose(found.stamp_ns, stamps, rtol=0, atol=MS / 2)
-    assert f"in bursts of {samples}, {samples * 20} ms apart" in found.note("samples")
+    assert f"in bursts of {samples}, {samples * 20} ms apart" in found.sentence("samples")
 
 
 def test_a_gap_between_packets_stays_a_gap() -> None:
