@@ -314,11 +314,11 @@ def _fixes(
     return PositionFixes(stamps[rows], north, east, var_north, var_east, covariance, stated), datum
 
 
-FAR_TURN_RAD, FAR_M = math.radians(0.5), 285e3
+FAR_TURN_RAD, FAR_DATUM_M = math.radians(0.5), 285e3
 """Turn of a local plane at the fixes, and distance, above which its origin is too far away [rad, m]. At this distance
 the plane is 0.1 % too small; a smaller turn is found and corrected with the heading."""
 
-EARTH_RADIUS_M = 6_371_000.0
+MEAN_EARTH_RADIUS_M = 6_371_000.0
 """Mean radius of the earth [m]."""
 
 
@@ -336,8 +336,8 @@ def _far_datum(source: PositionSource, config: Config) -> list[Note]:
     (lat, lon), (lat_0, lon_0) = np.radians([(latitude, longitude), config.frames.datum]).tolist()
     apart = math.remainder(lon - lon_0, 2.0 * math.pi)
     turn, middle = apart * math.sin((lat + lat_0) / 2), math.cos(lat) * math.cos(lat_0) * math.sin(apart / 2) ** 2
-    far_m = 2.0 * EARTH_RADIUS_M * math.asin(min(math.sqrt(math.sin((lat - lat_0) / 2) ** 2 + middle), 1.0))
-    if abs(turn) <= FAR_TURN_RAD and far_m <= FAR_M:
+    far_m = 2.0 * MEAN_EARTH_RADIUS_M * math.asin(min(math.sqrt(math.sin((lat - lat_0) / 2) ** 2 + middle), 1.0))
+    if abs(turn) <= FAR_TURN_RAD and far_m <= FAR_DATUM_M:
         return []
     what = f"frames.datum lies {far_m / 1e3:,.0f} km from the fixes ({latitude:.4f}, {longitude:.4f})"
     plane = f"its local plane is turned by {abs(math.degrees(turn)):.1f}° there"
@@ -353,7 +353,7 @@ def _spread(source: PositionSource, clock: Clock) -> tuple[StampedRows, list[Not
     rows, stamps = np.flatnonzero(source.usable), source.stamps.on(clock)
     if source.geodetic is not None:
         latitude, longitude, _ = np.radians(source.geodetic[rows]).T
-        place = EARTH_RADIUS_M * (latitude + 1j * longitude * np.cos(latitude))
+        place = MEAN_EARTH_RADIUS_M * (latitude + 1j * longitude * np.cos(latitude))
     else:
         place = np.asarray(source.metric, np.float64)[rows] @ np.array([1.0, 1j])
     by_header = clock == "header" and source.stamps.header_ns is not None
