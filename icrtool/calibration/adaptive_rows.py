@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool.calibration.held_out import path_between
 from icrtool.calibration.record import Calibration
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Ints
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Ints, Rows
 from icrtool.kernels.track import OpenLoopPath, Track
 from icrtool.motion.adaptive import AdaptiveModel, Learned, TermsPrior
 from icrtool.motion.drive_buffer import SampleRow
@@ -18,10 +18,26 @@ from icrtool.motion.robot_prior import prior_of_robots
 from icrtool.motion.window_fit import Prediction
 
 
-def prior_for(recording: Recording, calibrations: Sequence[Calibration] = ()) -> TermsPrior:
-    """Return what is known before a recording: of calibrations the first one not fitted to it, else of robots."""
-    found = (one.prior() for one in calibrations if not one.fitted_to(recording.sha256))
-    return next(found, None) or prior_of_robots(recording.width_m)
+def prior_for(
+    recording: Recording, calibrations: Sequence[Calibration] = (), *, refit_sensors: bool = False
+) -> TermsPrior:
+    """Return what is known before a recording: of calibrations the first one not fitted to it, else of robots.
+
+    Parameters
+    ----------
+    refit_sensors : the constants of the calibration's sensors are not used
+
+    Notes
+    -----
+    Of the sensors' constants, the heading offset and the bias of the gyro come from the calibration. The delays begin
+    at those that were corrected in this log, as for row ``icr``: between five drives of one robot, recorded by one
+    computer, they differ by 0.08 s.
+    """
+    found = next((one for one in calibrations if not one.fitted_to(recording.sha256)), None)
+    if found is None:
+        return prior_of_robots(recording.width_m)
+    known = recording.corrected._replace(wheels_later_s=np.nan, gyro_later_s=np.nan)
+    return found.prior(corrected=None if refit_sensors else known, heading_source=recording.heading_source)
 
 
 def samples_of(recording: Recording, rows: slice = slice(None)) -> Floats:
@@ -37,31 +53,29 @@ def samples_of(recording: Recording, rows: slice = slice(None)) -> Floats:
 
 
 @dataclass(frozen=True)
-class AdaptedDrive:
-    """A recording as `AdaptiveModel` drove it.
+class KnownDrive:
+    """A recording, and the model and constants that were known at each time of it.
 
     Attributes
     ----------
-    prior : what was known before
     learned : what was known, in order of time; the first one before the drive
-    steps : the wheel samples joined
+    steps : the wheel samples joined; None: single samples
     """
 
     recording: Recording
-    prior: TermsPrior
     learned: tuple[Learned, ...]
-    steps: Track
+    steps: Track | None = None
 
     def errors(self, trials: Trials, *, turned: bool = False) -> TrialErrors:
         """Return the errors of trials, each with what was known at its start; `turned`: with the gyro."""
-        track, errors = self.recording.track, TrialErrors.none(trials.ends.shape)
+        errors = TrialErrors.none(trials.ends.shape)
         for number, some in self._by_learned(trials.starts):
             column, row = np.nonzero(trials.ends[some].T >= 0)
             if not len(row):
                 continue
             row += some.start
             start, end = trials.starts[row], trials.ends[row, column]
-            near = self.steps.around(track.t[start.min()], track.t[end.max()])
+            near = self._steps_around(start, end)
             path = predicted_path(self.recording, *self._known(number, turned=turned), near)
             for all_errors, missed in zip(errors, trial_errors(self.recording, start, end, path), strict=True):
                 all_errors[row, column] = missed
@@ -69,8 +83,16 @@ class AdaptedDrive:
 
     def path(self, start: int, end: int, *, turned: bool = False) -> OpenLoopPath:
         """Return the path from one state to another, with what was known at the first one."""
-        ((number, _),) = self._by_learned(np.array([start]))
-        return path_between(self.recording, self._known(number, turned=turned), self.steps, start, end)
+        one = np.array([start], np.int64)
+        ((number, _),) = self._by_learned(one)
+        steps = self._steps_around(one, np.array([end], np.int64))
+        return path_between(self.recording, self._known(number, turned=turned), steps, start, end)
+
+    def _steps_around(self, start: Ints, end: Ints | Rows) -> Track:
+        """Return the wheel samples of trials from some states to others."""
+        track = self.recording.track
+        span = float(track.t[start.min()]), float(track.t[end.max()])
+        return self.recording.wheels(track.rows_around(*span)) if self.steps is None else self.steps.around(*span)
 
     def _by_learned(self, starts: Ints) -> Iterator[tuple[int, slice]]:
         """Yield the number of what was known, and the starts (ascending) from which on it was."""
@@ -85,11 +107,17 @@ class AdaptedDrive:
         return (one.turned, one.turned_constants) if turned and one.turned is not None else (one.fitted, one.constants)
 
 
-def adapt(recording: Recording, prior: TermsPrior) -> AdaptedDrive:
-    """Let `AdaptiveModel` drive a recording, with its gyro where it has one."""
+def adapt(recording: Recording, prior: TermsPrior, past: Recording | None = None) -> KnownDrive:
+    """Let `AdaptiveModel` drive a recording, with its gyro where it has one.
+
+    Parameters
+    ----------
+    past : the recording with the poses that were known when it was driven; default: its own
+    """
+    past = recording if past is None else past
     model = AdaptiveModel(prior, with_gyro=recording.track.gyro is not None)
     learned = [model.now._replace(t_s=-np.inf)]
     for lo in range(0, len(recording.track.t), ROWS_AT_ONCE):
-        learned += model.observe_all(samples_of(recording, slice(lo, lo + ROWS_AT_ONCE)))
+        learned += model.observe_all(samples_of(past, slice(lo, lo + ROWS_AT_ONCE)))
     # the shortest steps, however long the log is: its end must not change what is predicted before
-    return AdaptedDrive(recording, prior, tuple(learned), steps_of(recording, 0.0))
+    return KnownDrive(recording, tuple(learned), steps_of(recording, 0.0))

@@ -16,6 +16,7 @@ from msgspec.structs import asdict
 
 from icrtool import __version__
 from icrtool.calibration import held_out
+from icrtool.calibration.held_sensors import FEWEST_POOLED, sensors_of
 from icrtool.calibration.other_grounds import leave_grounds_out
 from icrtool.calibration.record import (
     MULTIPLIER_BETWEEN_SHARE,
@@ -27,9 +28,17 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.kernels.error_statistics import between_variance, pooled_variance
-from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, Lever, TrackGeometry
-from icrtool.motion.recording import ErrorsOf, GyroLine, PastLines, Recording, cut_windows, fit_gyro_line
-from icrtool.motion.window_fit import Fold, Pool, Prediction, own_constants
+from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, FittedModel, Lever, TrackGeometry
+from icrtool.motion.recording import (
+    ErrorsOf,
+    GyroLine,
+    LogConstants,
+    PastLines,
+    Recording,
+    cut_windows,
+    fit_gyro_line,
+)
+from icrtool.motion.window_fit import Fold, Pool, own_constants
 from icrtool.records import calibration_document as documents
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.notes import Note, note
@@ -67,8 +76,17 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         lever=Lever(*(place is not None for place in known_antenna_m(run))),
         x_clock_std_m=run.document.icr.x_clock_std_m,
         wheel_scales=(left, right),
+        corrected=_corrected(run),
+        heading_source=run.document.heading.source,
     )
     return plain if heading is None else with_turn_rate(plain, heading, run.config.frames.gyro_delay_s)
+
+
+def _corrected(run: Run) -> LogConstants:
+    """Return the constants that were corrected in the streams of a run; an estimated heading has no offset."""
+    offset_deg = 0.0 if run.sensors.facts.heading_is_estimated else run.document.heading.applied_offset_deg
+    position = run.document.alignment.get("position_delay_s")
+    return LogConstants(-math.radians(offset_deg), 0.0 if position is None else -position.applied)
 
 
 def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
@@ -104,8 +122,10 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | 
     give_back_freed()
     if not line.is_yaw:
         return plain
-    track = plain.track._replace(gyro=np.sign(line.scale) * rate(line.lead_s if delay_s == "auto" else delay_s))
-    return replace(plain, track=track, gyro_reversed=line.scale < 0.0)
+    later_s = line.lead_s if delay_s == "auto" else delay_s
+    track = plain.track._replace(gyro=np.sign(line.scale) * rate(later_s))
+    corrected = plain.corrected._replace(gyro_later_s=later_s)
+    return replace(plain, track=track, gyro_reversed=line.scale < 0.0, corrected=corrected)
 
 
 def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
@@ -191,11 +211,14 @@ def calibration_from(
 ) -> Calibration:
     """Return the calibration from the recordings of a held-out table."""
     recordings, best = table.recordings, table.fits[RECOMMENDED]
+    with_gyro = table.fits[f"{RECOMMENDED}{held_out.GYRO_SUFFIX}"].fitted if table.has_gyro else None
     logs = []
     for i, one in enumerate(recordings):
         own, metres = best.constants(i), float(one.track.distance[-1])
         offset_deg, delay_s = math.degrees(own.heading_offset_rad), -own.wheels_later_s
-        logs.append(documents.CalibrationLog(one.name, one.path, one.sha256, metres, offset_deg, delay_s, one.begin_ns))
+        sensors = sensors_of(one, best.pool.windows[i], best.fitted, with_gyro)
+        numbers = metres, offset_deg, delay_s, one.begin_ns
+        logs.append(documents.CalibrationLog(one.name, one.path, one.sha256, *numbers, sensors=sensors))
     by_fold, together = [], []
     for row in table.scores:
         # A score without trials is left out.
@@ -209,10 +232,9 @@ def calibration_from(
                 p95, expected = float(row.together.p95[h]), float(row.together.expected[h])
                 together.append(documents.PooledScore(row.name, horizon, p95, expected))
     gyro = None
-    if table.has_gyro:
-        turned = table.fits[f"{RECOMMENDED}{held_out.GYRO_SUFFIX}"].fitted
+    if with_gyro is not None:
         sources = held_out.measure_error_sources(table, f"{RECOMMENDED}{held_out.GYRO_SUFFIX}")
-        gyro = documents.GyroDocument(turned.model.name, *parameter_documents(turned), sources)
+        gyro = documents.GyroDocument(with_gyro.model.name, *parameter_documents(with_gyro), sources)
     robot = robot if robot is not None else documents.CalibratedRobot(track_width_m=recordings[0].width_m)
     geometry, covariance = table.fits[FIVE].fitted.geometry(robot.track_width_m)
     shared_std = multiplier_between_std(table, robot.track_width_m, geometry.multiplier)
@@ -239,10 +261,6 @@ def calibration_from(
     )
 
 
-FEWEST_POOLED = 3
-"""Number of logs from which on the spread between drives is estimated."""
-
-
 def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: float) -> float | None:
     """Return the standard deviation of the multiplier between the logs of a calibration; None of one or two logs.
 
@@ -263,14 +281,15 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return the function that gives the errors of a calibration in trials of a recording; see `calibrated`."""
-    found = calibrated(calibration, recording, with_gyro=with_gyro)
+    """Return the function that gives the errors of a calibration in trials of a recording, with its own constants."""
+    fitted = model_for(calibration, recording, with_gyro=with_gyro)
+    found = fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]
     return lambda trials: held_out.errors_without(recording, trials, folds, 0, lambda _: found)
 
 
-def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Prediction:
-    """Return the model of a calibration for a recording, and the recording's constants.
+def model_for(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> FittedModel:
+    """Return the model of a calibration for a recording.
 
     Parameters
     ----------
@@ -280,12 +299,6 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
     ------
     ConfigError
         The calibration is of a robot of another width; or with_gyro, and one of the two has no gyro.
-    DataError
-        The drive is too short to find its own constants.
-
-    Notes
-    -----
-    Constants of the recording are found in it with the parameters held.
     """
     if abs(recording.width_m - calibration.width_m) > 1e-3 * calibration.width_m:
         why = f"{recording.width_m:g} m, the calibration is of a robot of {calibration.width_m:g} m"
@@ -293,8 +306,7 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
     if with_gyro and (calibration.gyro is None or recording.track.gyro is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     turned = calibration.fitted_with_gyro if with_gyro else None
-    fitted = calibration.fitted if turned is None else turned
-    return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
+    return calibration.fitted if turned is None else turned
 
 
 SAME_SHARE = 0.98

@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from icrtool.alignment.wheel_units import with_wheel_speeds
+from icrtool.calibration.held_sensors import left_of, pooled_constants
 from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.adaptive import TermsPrior
@@ -29,6 +30,7 @@ from icrtool.motion.models import (
     find_model,
     wheel_motion,
 )
+from icrtool.motion.recording import NO_CONSTANTS, LogConstants
 from icrtool.motion.robot_prior import prior_of_model
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
@@ -189,10 +191,26 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         source = "" if self.name is UNSET else self.name
         return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m, source)
 
-    def prior(self) -> TermsPrior:
-        """Return what it shows of the robot's next drive, for `icrtool.AdaptiveModel` to begin with."""
+    def prior(self, *, corrected: LogConstants | None = NO_CONSTANTS, heading_source: str | None = None) -> TermsPrior:
+        """Return what it shows of the robot's next drive, for `icrtool.AdaptiveModel` to begin with.
+
+        Parameters
+        ----------
+        corrected : constants of the sensors that are corrected in what the model observes. One that is NaN was found in
+            the drive itself: its usual spread about zero is left. None: all are corrected, and begin at zero. Default:
+            nothing is corrected, and the model begins with the constants of the calibration
+        heading_source : as ``heading.source`` of run.json; the calibration's heading offset is used for a heading of
+            this source alone. Default: the source of its logs
+        """
         source = "calibration" if self.name is UNSET else self.name
-        return prior_of_model(self.width_m, self.fitted, self.fitted_with_gyro, source)
+        prior = prior_of_model(self.width_m, self.fitted, self.fitted_with_gyro, source)
+        if corrected is None:
+            return prior
+        wheels, turned = (
+            left_of(pooled_constants(self.logs, heading_source, with_gyro=with_gyro), corrected).usual()
+            for with_gyro in (False, True)
+        )
+        return replace(prior, constants=wheels, turned_constants=turned)
 
     def fitted_to(self, sha256: str) -> bool:
         """Return whether a log was among those the calibration was fitted to."""

@@ -8,6 +8,7 @@ wheels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -139,10 +140,23 @@ class ComparedRow(NamedTuple):
     knows: str = ""
 
 
-def adaptive_rows(recording: Recording, heading: str, calibrations: Sequence[Calibration] = ()) -> list[ComparedRow]:
-    """Return row ``adaptive`` of a recording, and the one with the measured heading of a kind where it has one."""
-    drive = adapt(recording, prior_for(recording, calibrations))
-    knows = f"{drive.prior.source}, and {PAST}, {INSTALLATION}"
+def adaptive_rows(
+    recording: Recording,
+    heading: str,
+    calibrations: Sequence[Calibration] = (),
+    past: Recording | None = None,
+    *,
+    refit_sensors: bool = False,
+) -> list[ComparedRow]:
+    """Return row ``adaptive`` of a recording, and the one with the measured heading of a kind where it has one.
+
+    Parameters
+    ----------
+    past, refit_sensors : as in `icrtool.calibration.adaptive_rows.adapt` and `prior_for`
+    """
+    prior = prior_for(recording, calibrations, refit_sensors=refit_sensors)
+    drive = adapt(recording, prior, past)
+    knows = f"{prior.source}, and {PAST}, {INSTALLATION}"
     rows = [ComparedRow("adaptive", drive.errors, drive.path, knows)]
     if heading:
         turned = partial(drive.errors, turned=True), partial(drive.path, turned=True)
@@ -171,7 +185,12 @@ class ComparedModels(NamedTuple):
 
 
 def compare_models(
-    run: Run, headings: Iterable[MeasuredHeading] = (), calibrations: Sequence[Calibration] = ()
+    run: Run,
+    headings: Iterable[MeasuredHeading] = (),
+    calibrations: Sequence[Calibration] = (),
+    past: Run | None = None,
+    *,
+    refit_sensors: bool = False,
 ) -> ComparedModels:
     """Test every model on distance it was not fitted to.
 
@@ -180,6 +199,8 @@ def compare_models(
     run : a finished run, or one read back
     headings : measured headings, best first, for the models with a measured turn rate
     calibrations : row ``adaptive`` begins with the first one that was not fitted to this log, else with other robots
+    past : the run with the poses that were known when it was driven; default: its own, of the filter
+    refit_sensors : row ``adaptive`` begins without the constants of the calibration's sensors
 
     Raises
     ------
@@ -200,12 +221,22 @@ def compare_models(
         notes.append(note("lever_unknown", why))
     found = hold_out([recording])
     give_back_freed()
-    rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
-    rows += adaptive_rows(recording, heading, calibrations)
+    driven = recording if past is None else with_poses_of(recording, past)
+    rows = [
+        row for row in _rows(run, found, heading, driven) if run.track_width_m is not None or NO_SLIP not in row.name
+    ]
+    rows += adaptive_rows(recording, heading, calibrations, driven, refit_sensors=refit_sensors)
     calibration = None
     if run.track_width_m is not None:
         calibration = pooled.calibration_from(found, pooled.robot_of(run, recording.width_m), pooled.use_notes(run))
     return ComparedModels(tuple(rows), found, recording.track, heading, tuple(notes), calibration)
+
+
+def with_poses_of(recording: Recording, run: Run) -> Recording:
+    """Return a recording with the poses of a run of the same states."""
+    table = run.table
+    track = recording.track._replace(north=table.north_m, east=table.east_m, heading=table.heading_rad)
+    return replace(recording, track=track)
 
 
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, list[Note]]:
@@ -227,8 +258,11 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
     return plain, "", notes
 
 
-def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
-    """Yield the held-out rows; the rows of the filter's ICRs with a measured heading come last."""
+def _rows(run: Run, found: HeldOut, kind: str, past: Recording) -> Iterator[ComparedRow]:
+    """Yield the held-out rows; the rows of the filter's ICRs with a measured heading come last.
+
+    `past` is the recording with the poses that were known when it was driven.
+    """
     for name in found.rows:
         if name == NO_SLIP:
             continue
@@ -240,7 +274,7 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
             # Both have the middle of the ICRs at the origin: with a measured turn both would equal no_slip_gyro.
             if not row_of(one.name).compared:
                 of_past = one.name == "icr"
-                lines = partial(past_gyro_lines, recording.track) if of_past else partial(pooled.gyro_line, recording)
+                lines = partial(past_gyro_lines, past.track) if of_past else partial(pooled.gyro_line, recording)
                 errors_of = partial(_errors_turned, run, recording, one.icrs, lines)
                 yield ComparedRow(f"{one.name}_{kind}", errors_of, knows=one.knows)
 

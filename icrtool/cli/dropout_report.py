@@ -53,6 +53,8 @@ REPORT_OPTIONS = options.reporting(
            "ones."),
     option("--calibration calibration_files", "CAL.json", FILE, "Also predict with a calibration that icrtool "
            "calibrate wrote; repeatable.", multiple=True),
+    flag("--refit-sensors", "Refit heading offset, delays and gyro bias of the calibrations in this log, in place of "
+         "those that they hold."),
     option("--score", "TOPIC", None, "Also compare the poses of a topic with the reference, for example "
            "/odometry/filtered; needs the LOG, which is read again; repeatable.", multiple=True),
     option("--outage outage_s", "SECONDS", POSITIVE, "Force GNSS outages of this length, and report the error at their "

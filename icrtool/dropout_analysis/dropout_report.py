@@ -13,10 +13,11 @@ from msgspec import UNSET
 from msgspec.structs import astuple
 
 from icrtool import __version__
+from icrtool.calibration.calibration_rows import calibrated_drive
 from icrtool.calibration.other_grounds import other_ground_ends
-from icrtool.calibration.pooled import predictor, turning_recording_of
+from icrtool.calibration.pooled import turning_recording_of
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, compare_models
+from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, compare_models, with_poses_of
 from icrtool.dropout_analysis import report, shown_paths
 from icrtool.dropout_analysis.guard import why_unusable
 from icrtool.dropout_analysis.starts import split_by_turning, with_smoothed_reference
@@ -118,6 +119,7 @@ def dropout_report(
     reference: Reference = "filter",
     without_events: bool = False,
     with_jumps: bool = False,
+    refit_sensors: bool = False,
     ladder: bool = True,
     score: Sequence[str] = (),
     seed: int = DEFAULT_SEED,
@@ -136,6 +138,7 @@ def dropout_report(
     outage_s, outage_at_s : lengths and begins of forced outages [s]
     starts, reference : states that trials start from; estimates that trials are compared with
     without_events, with_jumps : which trials count
+    refit_sensors : heading offset, delays and gyro bias are refitted in this log for `calibrations`
     ladder, seed : whether models are tested on held-out distance; seed of the random draws
     score : topics of poses in the log; each becomes a row ``topic:NAME``
     log : the log of the run, in a form that `icrtool.read_log` takes; scored topics are read from it
@@ -173,6 +176,7 @@ def dropout_report(
         reference=reference,
         without_events=without_events,
         with_jumps=with_jumps,
+        refit_sensors=refit_sensors,
         ladder=ladder,
         score=tuple(score),
         seed=seed,
@@ -212,12 +216,14 @@ def report_on(
     # Computed and released before the comparison, whose columns are as large: this bounds memory.
     examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, request.starts)
     give_back_freed()
-    used, further = _calibration_rows(compared, () if unusable else calibrations)
+    used, further, of_sensors = _calibration_rows(compared, run, () if unusable else calibrations, request)
     of_topics, topic_notes = topic_rows(compared, track_of(compared), scored) if scored and not unusable else ([], [])
     found, why = None, unusable
     if request.ladder and not unusable:
         try:
-            found = compare_models(compared, measured_headings(run), calibrations)
+            found = compare_models(
+                compared, measured_headings(run), calibrations, run, refit_sensors=request.refit_sensors
+            )
         except DataError as err:
             why = f"{err.why}, {err.advice}"
     give_back_freed()
@@ -268,7 +274,7 @@ def report_on(
         usable=not unusable,
         baseline=baseline,
         by_turning=by_turning,
-        notes=tuple(topic_notes),
+        notes=(*of_sensors, *topic_notes),
     )  # fmt: skip
 
 
@@ -452,13 +458,17 @@ def with_other_grounds(
 
 
 def _calibration_rows(
-    run: Run, calibrations: Sequence[Calibration]
-) -> tuple[tuple[UsedCalibration, ...], list[ComparedRow]]:
-    """Return the record of each used calibration, and the models of their rows."""
-    used, models = [], []
+    run: Run, past: Run, calibrations: Sequence[Calibration], request: ReportRequest
+) -> tuple[tuple[UsedCalibration, ...], list[ComparedRow], list[Note]]:
+    """Return the record of each used calibration, the models of their rows, and notes about their sensors.
+
+    `past` is the run with the poses of the filter.
+    """
+    used, models, notes = [], [], list[Note]()
     if not calibrations:
-        return (), []
+        return (), [], []
     recording = turning_recording_of(run)
+    driven = with_poses_of(recording, past)
     for number, one in enumerate(calibrations, start=1):
         name = "calibration"
         if len(calibrations) > 1:
@@ -471,12 +481,16 @@ def _calibration_rows(
         kept = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
         seen = one.fitted_to(recording.sha256)
         fitted = "fitted to this log" if seen else "not fitted to this log"
-        knows = f"other logs ({fitted}); heading offset, wheel delay and gyro bias from this drive"
         rows = [(name, one.recommended, False)]
         if one.gyro is not None and recording.track.gyro is not None:
             rows.append((f"{name}_gyro", one.gyro.model, True))
-        for name, model, with_gyro in rows:
-            errors_of = predictor(one, recording, with_gyro=with_gyro)
-            models.append(ComparedRow(name, errors_of, knows=knows))
-            used.append(UsedCalibration(name, model, len(one.logs), seen, created, with_gyro, kept, fitted))
-    return tuple(used), models
+        for row, model, with_gyro in rows:
+            tested = calibrated_drive(
+                one, recording, row, driven, with_gyro=with_gyro, refit_sensors=request.refit_sensors
+            )
+            models.append(ComparedRow(row, tested.drive.errors, knows=f"other logs ({fitted}); {tested.knows}"))
+            notes += tested.notes
+            used.append(
+                UsedCalibration(row, model, len(one.logs), seen, created, with_gyro, kept, fitted, tested.sensors)
+            )
+    return tuple(used), models, notes

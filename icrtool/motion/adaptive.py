@@ -23,7 +23,15 @@ from icrtool.kernels.window_residuals import OMEGA
 from icrtool.motion.drive_buffer import LARGEST_ADVANCE_M, DriveBuffer
 from icrtool.motion.models import GYRO_TERMS, MODELS, RECOMMENDED, TERMS, FittedModel, MotionModel, wheel_motion
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, size_of
-from icrtool.motion.window_fit import RESIDUAL_KINDS, Residuals, constant_std, heading_wander, residuals_of
+from icrtool.motion.window_fit import (
+    RESIDUAL_KINDS,
+    UNKNOWN_CONSTANTS,
+    KnownConstants,
+    Residuals,
+    constant_std,
+    heading_wander,
+    residuals_of,
+)
 
 WINDOWS_AS_ONE = 80.0
 """Number of windows that count as one independent window. A stretch of 20 m holds 160 windows and shows a term about
@@ -83,6 +91,7 @@ class TermsPrior:
     mean, covariance : (8,), (8, 8)
     turned_mean, turned_covariance : of the terms of the model with a gyro (6,), (6, 6)
     source : what it was made from, in a few words
+    constants, turned_constants : what is known of the drive's constants, with wheels alone and with a gyro
     """
 
     width_m: float
@@ -91,6 +100,8 @@ class TermsPrior:
     turned_mean: Floats
     turned_covariance: Floats
     source: str = ""
+    constants: KnownConstants = UNKNOWN_CONSTANTS
+    turned_constants: KnownConstants = UNKNOWN_CONSTANTS
 
     @classmethod
     def of_wheels(cls, width_m: float, mean: Floats, covariance: Floats, source: str = "") -> TermsPrior:
@@ -134,15 +145,17 @@ class Estimate:
     fitted, constants : x as the model and the constants that predict
     """
 
-    def __init__(self, model: MotionModel, width_m: float, mean: Floats, covariance: Floats) -> None:
+    def __init__(
+        self, model: MotionModel, width_m: float, mean: Floats, covariance: Floats, constants: KnownConstants
+    ) -> None:
         self.model, self.width_m = model, width_m
-        own, k = constant_std(model), len(model.terms)
-        self.mean = np.concatenate([mean, np.zeros(len(own))])
-        self.prior = np.diag(np.concatenate([np.zeros(k), own**-2.0]))
+        own, k = len(constant_std(model)), len(model.terms)
+        self.mean = np.concatenate([mean, constants.mean[:own]])
+        self.prior = np.diag(np.concatenate([np.zeros(k), np.array(constants.std[:own]) ** -2.0]))
         self.prior[:k, :k] = np.linalg.inv(covariance)
         self.matrix, self.vector = np.zeros_like(self.prior), np.zeros_like(self.mean)
         self.x, self.scale, self.wander = self.mean, np.array(USUAL_STD), 0.0
-        self.fitted, self.constants = FittedModel(model, mean, covariance), NO_CONSTANTS
+        self.fitted, self.constants = FittedModel(model, mean, covariance), LogConstants(*constants.mean[:own])
 
     def solve_anew(self, windows: Windows, wheels: FittedModel | None = None) -> None:
         """Solve with all windows that have ended, linearised at every step; `wheels` as in `residuals_of`."""
@@ -225,10 +238,11 @@ class AdaptiveModel:
         self.prior, self.with_gyro, self.distance_m = prior, with_gyro, 0.0
         size = size_of(prior.width_m)
         self._drive, self._longest_m = DriveBuffer(size), LARGEST_ADVANCE_M * size
-        self._wheels = Estimate(WHEELS_MODEL, prior.width_m, prior.mean, prior.covariance)
+        self._wheels = Estimate(WHEELS_MODEL, prior.width_m, prior.mean, prior.covariance, prior.constants)
         self._turned = None
         if with_gyro:
-            turned = Estimate(TURNED_MODEL, prior.width_m, prior.turned_mean, prior.turned_covariance)
+            terms = prior.turned_mean, prior.turned_covariance
+            turned = Estimate(TURNED_MODEL, prior.width_m, *terms, prior.turned_constants)
             turned.fitted = FittedModel(turned.model, prior.turned_mean, prior.turned_covariance, self._wheels.fitted)
             self._turned = turned
         self._used, self._next_m, self._next_anew_m = 0, SHORTEST_M * size, 0.0

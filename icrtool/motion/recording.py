@@ -51,41 +51,6 @@ STRETCH_M = 20.0
 FEWEST_FIT_WINDOWS = 10
 
 
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """One log as input of the motion models.
-
-    Attributes
-    ----------
-    track : its states, and the turn rate of its gyro; its wheel speeds are as recorded
-    width_m : track width b
-    path, sha256 : the log's first file; empty where it is not known
-    gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
-    begin_ns : stamp of the first state; 0 where it is not known
-    lever : which parts of the measured point's place on the robot are known
-    x_clock_std_m : standard deviation of x_icr [m] from the unknown time between position and heading
-    wheel_scales : ratios of the left and right speeds of `track` to the speeds that models are fitted to
-    """
-
-    name: str
-    track: Track
-    width_m: float
-    path: str = ""
-    sha256: str = ""
-    gyro_reversed: bool = False
-    begin_ns: int = 0
-    lever: Lever = NO_LEVER
-    x_clock_std_m: float = 0.0
-    wheel_scales: tuple[float, float] = (1.0, 1.0)
-
-    def wheels(self, rows: Ints | slice = slice(None)) -> Track:
-        """Return the track with some of its wheel samples, with the speeds that models are fitted to."""
-        some, (left, right) = self.track.wheels(rows), self.wheel_scales
-        if (left, right) == (1.0, 1.0):
-            return some
-        return some._replace(v_left=some.v_left / left, v_right=some.v_right / right)
-
-
 class LogConstants(NamedTuple):
     """Constants of one recording, in addition to the parameters of its robot.
 
@@ -102,8 +67,60 @@ class LogConstants(NamedTuple):
     gyro_bias_radps: float = 0.0
     gyro_later_s: float = 0.0
 
+    def plus(self, other: LogConstants) -> LogConstants:
+        """Return the sum of two corrections; the heading offset is within half a turn."""
+        return self._summed(other, 1.0)
+
+    def minus(self, other: LogConstants) -> LogConstants:
+        """Return the difference of two corrections; the heading offset is within half a turn."""
+        return self._summed(other, -1.0)
+
+    def _summed(self, other: LogConstants, sign: float) -> LogConstants:
+        offset, *others = (one + sign * two for one, two in zip(self, other, strict=True))
+        return LogConstants(math.remainder(offset, 2.0 * math.pi), *others)
+
 
 NO_CONSTANTS = LogConstants()
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One log as input of the motion models.
+
+    Attributes
+    ----------
+    track : its states, and the turn rate of its gyro; its wheel speeds are as recorded
+    width_m : track width b
+    path, sha256 : the log's first file; empty where it is not known
+    gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
+    begin_ns : stamp of the first state; 0 where it is not known
+    lever : which parts of the measured point's place on the robot are known
+    x_clock_std_m : standard deviation of x_icr [m] from the unknown time between position and heading
+    wheel_scales : ratios of the left and right speeds of `track` to the speeds that models are fitted to
+    corrected : constants that were corrected in `track` before; with the constants that are found in it, what the
+        sensors of the log had
+    heading_source : kind of the heading, as `HeadingFacts.source`; empty where it is not known
+    """
+
+    name: str
+    track: Track
+    width_m: float
+    path: str = ""
+    sha256: str = ""
+    gyro_reversed: bool = False
+    begin_ns: int = 0
+    lever: Lever = NO_LEVER
+    x_clock_std_m: float = 0.0
+    wheel_scales: tuple[float, float] = (1.0, 1.0)
+    corrected: LogConstants = NO_CONSTANTS
+    heading_source: str = ""
+
+    def wheels(self, rows: Ints | slice = slice(None)) -> Track:
+        """Return the track with some of its wheel samples, with the speeds that models are fitted to."""
+        some, (left, right) = self.track.wheels(rows), self.wheel_scales
+        if (left, right) == (1.0, 1.0):
+            return some
+        return some._replace(v_left=some.v_left / left, v_right=some.v_right / right)
 
 
 class Totals(NamedTuple):
@@ -383,6 +400,9 @@ GYRO_START_STD = (0.02, 0.005)
 """Standard deviations of a gyro's scale and bias [rad/s] before a drive, the same as in `TERMS` and
 `GYRO_PRIOR_STD`."""
 
+SMALLEST_SCALE_STD = 1e-6
+"""Standard deviation of a scale that is known. A turn of 1000 rad shows less than this."""
+
 TURN_NOISE_RAD = 0.01
 """Spread of the differences of turns over `TURN_S` that is assumed before a drive [rad]."""
 
@@ -421,7 +441,18 @@ class PastLines(NamedTuple):
 
 
 def past_gyro_lines(track: Track) -> PastLines:
-    """Return scale and bias of a track's gyro as known from the past of each state, without its lead.
+    """Return scale and bias of a track's gyro as known from the past of each state, without its lead."""
+    turned = np.zeros(len(track.t)) if track.gyro is None else track.cumulate(track.gyro)
+    return past_lines(track, lambda rows: turned[rows], GYRO_START_STD)
+
+
+def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tuple[float, float]) -> PastLines:
+    """Return the lines from turns to the turns of a track's reference as known from the past of each state.
+
+    Parameters
+    ----------
+    turned_at : gives how far something has turned at some states [rad], from any angle
+    before_std : standard deviations of scale and bias [rad/s] before the drive, about 1 and 0; with 0 the scale is 1
 
     Notes
     -----
@@ -429,15 +460,14 @@ def past_gyro_lines(track: Track) -> PastLines:
     equations, with the soft-L1 weight of its residual from the line before.
     """
     t, lasted = track.t - track.t[0], track.cumulate(np.ones(len(track.t)))
-    turned = np.zeros(len(t)) if track.gyro is None else track.cumulate(track.gyro)
     every = rows_at_steps(t, TURN_S)
     begins = [0.0]
     while begins[-1] < t[-1]:
         begins.append(begins[-1] + min(max(begins[-1], TURN_S), RENEWED_S))
     rows = np.searchsorted(t, begins[: max(len(begins) - 1, 1)])
-    made = [np.diff(column[every]).tolist() for column in (turned, lasted, track.heading)]
+    made = [np.diff(column).tolist() for column in (turned_at(every), lasted[every], track.heading[every])]
     # of scale - 1 and bias: information and its vector
-    a, b, c = GYRO_START_STD[0] ** -2.0, 0.0, GYRO_START_STD[1] ** -2.0
+    a, b, c = max(before_std[0], SMALLEST_SCALE_STD) ** -2.0, 0.0, before_std[1] ** -2.0
     p = q = scale = bias = 0.0
     count, sizes, done = GUESSED_TURNS, GUESSED_TURNS * TURN_NOISE_RAD / MEAN_TO_STD, 0
     lines = []

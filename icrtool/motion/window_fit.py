@@ -342,17 +342,76 @@ class PooledFit(FittedModel):
         return jacobian.T @ (weights * residuals), curvature
 
 
-def own_constants(windows: Windows, fitted: FittedModel, width_m: float) -> LogConstants:
-    """Return the constants of one recording for given parameters of the model."""
-    of_both, std = residuals_of(windows, fitted.model, width_m, fitted.wheels), constant_std(fitted.model)
+class KnownConstants(NamedTuple):
+    """Constants of a recording with their standard deviations; NaN where they are not known."""
 
-    def evaluate(constants: Floats) -> tuple[Floats, Floats]:
-        residuals, by = of_both(fitted.parameters, constants)
-        return residuals, by[:, len(fitted.parameters) :]
+    mean: LogConstants
+    std: LogConstants
+
+    def usual(self) -> KnownConstants:
+        """Return them with the prior of a drive, `CONSTANT_STD` about zero, in place of what is not known."""
+        both = zip(self.mean, self.std, UNKNOWN_CONSTANTS.std, strict=True)
+        pairs = [(mean, std) if np.isfinite(mean) else (0.0, usual) for mean, std, usual in both]
+        mean, std = zip(*pairs, strict=True)
+        return KnownConstants(LogConstants(*mean), LogConstants(*std))
+
+
+UNKNOWN_CONSTANTS = KnownConstants(LogConstants(), LogConstants(*CONSTANT_STD.tolist()))
+"""What is known of a drive's constants where nothing but the usual spread is known."""
+
+
+def own_constants(
+    windows: Windows, fitted: FittedModel, width_m: float, held: LogConstants | None = None
+) -> LogConstants:
+    """Return the constants of one recording for given parameters of the model.
+
+    Parameters
+    ----------
+    held : constants that keep their values; those that are NaN are estimated. Default: all are
+    """
+    known = np.full(len(constant_std(fitted.model)), np.nan)
+    if held is not None:
+        known = np.array(held)[: len(known)]
+    if not np.isnan(known).any():
+        return LogConstants(*known.tolist())
+    return LogConstants(*_fit_constants(windows, fitted, width_m, known, len(windows.begin) / 5.0)[0].tolist())
+
+
+def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) -> KnownConstants:
+    """Return the constants of one recording for given parameters of the model, with their standard deviations.
+
+    Notes
+    -----
+    Stretches of `STRETCH_M` are independent, as in the covariance of parameters. The parameters' own covariance is not
+    part of the deviations: constants are used with the parameters that they were measured with.
+    """
+    pool = Pool([windows], [width_m])
+    known = np.full(len(constant_std(fitted.model)), np.nan)
+    found, fit = _fit_constants(windows, fitted, width_m, known, pool.overlap)
+    std = np.sqrt(np.diag(student_covariance(fit, [pool.group])))
+    without = np.full(len(CONSTANT_STD) - len(known), np.nan)
+    return KnownConstants(*(LogConstants(*np.append(one, without).tolist()) for one in (found, std)))
+
+
+def _fit_constants(
+    windows: Windows, fitted: FittedModel, width_m: float, known: Floats, overlap: float
+) -> tuple[Floats, RobustFit]:
+    """Return all constants (c,), and the fit of those that are NaN in `known` (c,)."""
+    of_both, free = residuals_of(windows, fitted.model, width_m, fitted.wheels), np.isnan(known)
+    std = constant_std(fitted.model)[free]
+
+    def whole(values: Floats) -> Floats:
+        constants = known.copy()
+        constants[free] = values
+        return constants
+
+    def evaluate(values: Floats) -> tuple[Floats, Floats]:
+        residuals, by = of_both(fitted.parameters, whole(values))
+        return residuals, by[:, len(fitted.parameters) :][:, free]
 
     zero, kind = np.zeros(len(std)), np.repeat(RESIDUAL_KINDS, len(windows.begin))
-    overlap = len(windows.begin) / 5.0
-    return LogConstants(*robust_least_squares(evaluate, zero, zero, std, kind=kind, overlap=overlap).x.tolist())
+    fit = robust_least_squares(evaluate, zero, zero, std, kind=kind, overlap=overlap)
+    return whole(fit.x), fit
 
 
 class Pool:

@@ -52,15 +52,70 @@ class HeldOutScore(PooledScore, frozen=True):
     log: str
 
 
+class MeasuredConstant(Record, frozen=True):
+    """A constant of a sensor and its standard deviation."""
+
+    value: float
+    std: Share
+
+
+class SensorConstants(Record, frozen=True, kw_only=True):
+    """What relates the sensors of a log as they were sent, in addition to a motion model; None: not known.
+
+    Attributes
+    ----------
+    heading_offset_deg : added to the heading, as the configuration key of this name in ``frames``
+    reference_delay_s : time by which positions and headings lag the wheels
+    gyro_bias_degps : added to the turn rate of a model with a gyro, clockwise
+    gyro_delay_s : time by which the gyro lags the wheels
+    """
+
+    heading_offset_deg: MeasuredConstant | None = None
+    reference_delay_s: MeasuredConstant | None = None
+    gyro_bias_degps: MeasuredConstant | None = None
+    gyro_delay_s: MeasuredConstant | None = None
+
+
+class LogSensors(Record, frozen=True):
+    """Constants of the sensors of one log, corrections before the fit included, for both models of a calibration.
+
+    Attributes
+    ----------
+    heading_source : kind of its heading, as in ``heading`` of run.json; empty where it is not known
+    wheels, gyro : for the recommended model with wheels alone, and with a gyro; they were measured with the parameters
+        of the calibration
+    """
+
+    heading_source: str
+    wheels: SensorConstants
+    gyro: SensorConstants | None = None
+
+
+class HeldSensors(Record, frozen=True):
+    """Constants of the sensors that a calibration's row holds in a log.
+
+    Attributes
+    ----------
+    held : what the logs of the calibration give for a further drive, with its standard deviation; None: not known
+    measured : the constants of this log for the same parameters; None where the drive is too short
+    refitted : the row has the constants of this log in place of those held
+    """
+
+    held: SensorConstants
+    measured: SensorConstants | None
+    refitted: bool
+
+
 class CalibrationLog(Record, frozen=True):
     """A log that a calibration was fitted to, and its own constants.
 
     Attributes
     ----------
-    heading_offset_deg : offset of its reference's heading; wheels_delay_s : delay of its wheels with respect to its
-        poses, positive where the wheels lag
+    heading_offset_deg, wheels_delay_s : offset of its heading, and delay of its poses with respect to its wheels, both
+        after the corrections before the fit
     begin_ns : stamp of its first state; 0 where it is not known
     ground : name of its ground, where one was given
+    sensors : the constants of its sensors, corrections included; None in a file of an earlier version
     """
 
     name: str
@@ -71,6 +126,7 @@ class CalibrationLog(Record, frozen=True):
     wheels_delay_s: float
     begin_ns: int = 0
     ground: str | UnsetType = UNSET
+    sensors: LogSensors | None = None
 
 
 class GroundScore(Record, frozen=True):

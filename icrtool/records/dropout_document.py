@@ -15,7 +15,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.error_statistics import BlockSums, Histogram
 from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.acceptance import BudgetDistance, Verdict
-from icrtool.records.calibration_document import CalibrationDocument
+from icrtool.records.calibration_document import CalibrationDocument, HeldSensors
 from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.requests import ReportRequest
@@ -205,6 +205,7 @@ class UsedCalibration(Record, frozen=True):
     calibration : content of its file, without the models that were not recommended, the scores and the findings on
         sensors
     fitted : whether this log was among the logs that it was fitted to, in words
+    sensors : constants of the sensors that its row holds, and those of this log; None in a report of an earlier version
     """
 
     name: str
@@ -215,6 +216,7 @@ class UsedCalibration(Record, frozen=True):
     with_gyro: bool = False
     calibration: CalibrationDocument | None = None
     fitted: str = ""
+    sensors: HeldSensors | None = None
 
 
 class StartHeading(Record, frozen=True):

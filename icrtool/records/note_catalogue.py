@@ -161,6 +161,13 @@ OF_REPORTS: dict[str, Explanation] = {
         "GNSS or a map is in its poses: its row does not show the distance without GNSS.",
         "Record a drive in which the localisation runs without GNSS, and score that topic.",
     ),
+    "sensors_contradict_calibration": Explanation(
+        "warning",
+        "This log shows another heading offset or delay than the calibration holds, more than 3 σ apart.",
+        "The errors of row `calibration` hold the error of this constant; row `adaptive` begins with it.",
+        "Check whether a sensor was moved or a clock changed. `--refit-sensors` takes the constants of this log; "
+        "calibrate again where they are the new ones.",
+    ),
 }
 """Codes of findings about a dropout report."""
 

@@ -56,6 +56,8 @@ class ReportRequest(Record, frozen=True, kw_only=True):
     reference : what trials are compared with: the states of the filter or of the smoother
     without_events : trials that cross a slip event are left out
     with_jumps : trials that cross a jump of the reference are counted too, and models are fitted across it
+    refit_sensors : heading offset, delays and gyro bias of calibrations that are given are refitted in this log, in
+        place of those that the calibrations hold
     ladder : all models are also tested on distance that they were not fitted to
     score : topics of poses in the log, each compared with the reference as a row ``topic:NAME``
     seed : of the random draws
@@ -72,6 +74,7 @@ class ReportRequest(Record, frozen=True, kw_only=True):
     reference: Reference = "filter"
     without_events: bool = False
     with_jumps: bool = False
+    refit_sensors: bool = False
     ladder: bool = True
     score: tuple[str, ...] = ()
     seed: int = DEFAULT_SEED

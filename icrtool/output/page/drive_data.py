@@ -19,7 +19,8 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-from icrtool.calibration.pooled import calibrated, turning_recording_of
+from icrtool.calibration.calibration_rows import calibrated_drive
+from icrtool.calibration.pooled import turning_recording_of
 from icrtool.calibration.record import stored_calibration
 from icrtool.calibration.run_models import models_of
 from icrtool.errors import DataError
@@ -262,8 +263,13 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
         turned, document = one.with_gyro, one.calibration
         if recording is not None and document and not (turned and recording.track.gyro is None):
             with suppress(DataError):
-                model = calibrated(stored_calibration(document), recording, with_gyro=turned)
-                yield one.name, predicted_path(recording, *model)(recording.track.t[rows])
+                found = calibrated_drive(
+                    stored_calibration(document), recording, one.name, with_gyro=turned,
+                    refit_sensors=report.request.refit_sensors,
+                )  # fmt: skip
+                # one path for all starts: with the bias of the gyro as known at the end
+                known = found.drive.learned[-1]
+                yield one.name, predicted_path(recording, known.fitted, known.constants)(recording.track.t[rows])
 
 
 LARGEST_STEP = 32_000

@@ -15,6 +15,7 @@ from msgspec import UNSET
 from icrtool import __version__
 from icrtool.calibration.error_growth import Forecast
 from icrtool.calibration.held_out import HeldOut
+from icrtool.calibration.held_sensors import CONSTANT_WORDS, constant_text, constants_document, pooled_constants
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration, unfit_reasons
 from icrtool.calibration.sensor_findings import LABELS
@@ -56,6 +57,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
     model = [
         parameter_table(calibration.fitted, calibration.fitted_with_gyro),
         *held_out_blocks(table),
+        *sensor_tables(calibration),
         *(one.sentence for one in result.notes),
     ]
     return [
@@ -80,14 +82,13 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
     parameters: list[Block] = [
         parameter_table(found.fitted, found.fitted_with_gyro),
         Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
+        *sensor_tables(found),
     ]
     unfit = [one.text for one in unfit_reasons(found)]
-    head = ("log", "distance", "begins", "heading off", "wheels lag")
+    head = ("log", "distance", "begins", "heading offset", "poses lag")
     logs = [
-        (one.name, distance_text(one.distance_m), _date_text(one.begin_ns), f"{one.heading_offset_deg:+z.2f}°",
-         f"{one.wheels_delay_s:+z.3f} s")
-        for one in found.logs
-    ]  # fmt: skip
+        (one.name, distance_text(one.distance_m), _date_text(one.begin_ns), *_log_constants(one)) for one in found.logs
+    ]
     return [
         Line(f"Not fit for use: {'; '.join(unfit)}" if unfit else "", "bad"),
         Title(title, made),
@@ -98,6 +99,22 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
         Section("Logs", [Table("lr", logs, head)], name="logs"),
         Section("Warnings", [Items(found.warnings) if found.warnings else "None."], name="warnings"),
     ]
+
+
+def _log_constants(log: documents.CalibrationLog) -> tuple[str, str]:
+    """Return heading offset and delay of a log, corrections before the fit included where the file has them."""
+    if log.sensors is None:
+        return f"{log.heading_offset_deg:+z.2f}°", f"{log.wheels_delay_s:+z.3f} s"
+    texts = [constant_text(log.sensors.wheels, name) for name in ("heading_offset_deg", "reference_delay_s")]
+    return texts[0], texts[1]
+
+
+def sensor_tables(calibration: Calibration) -> list[Block]:
+    """Return the table of the sensors' constants that a calibration holds in a further drive; none of an old file."""
+    known = constants_document(pooled_constants(calibration.logs, with_gyro=calibration.gyro is not None))
+    texts = [(words, constant_text(known, name)) for name, (words, *_) in CONSTANT_WORDS.items()]
+    rows = [row for row in texts if row[1]]
+    return [Table("lr", rows, ("sensors, in a further drive", "value ± std"))] if rows else []
 
 
 def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) -> list[Section]:

@@ -147,7 +147,8 @@ def _source_lines(report: DropoutDocument) -> Iterator[str]:
 
 def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]:
     """Yield which trials count, what slip events cost, and why horizons are empty."""
-    reference = "; compared with the smoothed trajectory" if report.request.reference == "smoothed" else ""
+    smoothed = "; compared with the smoothed trajectory, which knows all of the drive"
+    reference = smoothed if report.request.reference == "smoothed" else ""
     moving = "moving " if report.request.starts == "moving" else ""
     yield f"a trial from each {moving}state of {report.starts:,}, by wheel speeds alone{reference}"
     if model_of(report, "no_slip") is None:

@@ -10,11 +10,13 @@ import pytest
 import icrtool
 from icrtool.calibration.adaptive_rows import adapt, prior_for
 from icrtool.calibration.pooled import recording_of
-from icrtool.calibration.run_models import adaptive_rows
+from icrtool.calibration.run_models import adaptive_rows, with_poses_of
 from icrtool.config import parse_config
+from icrtool.dropout_analysis.starts import with_smoothed_reference
 from icrtool.motion.adaptive import WHEELS_MODEL
 from icrtool.motion.recording import cut_trials
 from icrtool.motion.robot_prior import OTHER_ROBOTS, between_drives, prior_of_robots
+from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.run import Run
 from support.drives import make_log
 
@@ -115,3 +117,21 @@ def test_the_prior_of_robots_holds_the_robots_that_are_known() -> None:
     turn = WHEELS_MODEL.terms.index("omega_w")
     for gain in (0.439, 0.533, 0.564, 0.667):
         assert abs(gain - prior.mean[turn]) < 2.0 * std[turn]
+
+
+def test_with_a_smoothed_reference_the_row_learns_from_what_the_filter_knew() -> None:
+    """The smoother knows the rest of the drive, so only starts and ends of trials are taken from it."""
+    run = icrtool.fit(make_log(0, 60.0, rate=20.0), CONFIG, smooth=True)
+    compared, prior = with_smoothed_reference(run), prior_of_robots(0.6)
+    plain = adapt(recording_of(run), prior)
+    recording = recording_of(compared)
+    drive = adapt(recording, prior, with_poses_of(recording, run))
+    assert len(drive.learned) == len(plain.learned) > 10
+    for one, other in zip(drive.learned, plain.learned, strict=True):
+        np.testing.assert_array_equal(one.fitted.parameters, other.fitted.parameters)
+    knowing = adapt(recording, prior)
+    assert np.abs(knowing.learned[-1].fitted.parameters - plain.learned[-1].fitted.parameters).max() > 0.0
+    report = icrtool.dropout_report(run, reference="smoothed", horizons_m=[5.0])
+    expected = np.nanmean(drive.errors(cut_trials(recording, (5.0,))).position)
+    assert report.result("adaptive").column("expected_error_m")[0] == pytest.approx(expected, rel=1e-6)
+    assert "which knows all of the drive" in format_dropout(report)

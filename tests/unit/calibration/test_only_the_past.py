@@ -1,4 +1,4 @@
-"""Rows `icr` and `icr_gyro` know nothing of what follows a trial: cut logs, with corrections and noise fixed."""
+"""Rows `icr`, `calibration`, also with a gyro, know nothing of what follows a trial: cut logs, corrections fixed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import icrtool
+from icrtool.calibration.calibration_rows import calibrated_drive
 from icrtool.calibration.pooled import recording_of
 from icrtool.calibration.run_models import _errors_turned, models_of
 from icrtool.config import Config, load_config
@@ -95,3 +97,28 @@ def test_the_last_line_of_a_gyro_has_its_scale_and_bias(config: Config) -> None:
     assert (lines.scale[0], lines.bias_radps[0]) == (1.0, 0.0)
     assert lines.scale[-1] == pytest.approx(1.02, abs=0.005)
     assert lines.bias_radps[-1] == pytest.approx(0.004, abs=0.001)
+
+
+def test_a_calibration_is_tested_without_what_follows(config: Config) -> None:
+    """Constants held, bias of the gyro from the past: `--refit-sensors` alone knows what follows."""
+    log = with_gyro(make_log(3, 90.0))
+    calibration = icrtool.calibrate(fit(with_gyro(make_log(4, 90.0, faster=0.9)), config))
+
+    def errors(run: Run, *, turned: bool, refit: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        recording = recording_of(run, next(iter(measured_headings(run))))
+        starts = np.arange(0, len(run.table), 10)
+        ends = ends_from(recording.track, HORIZONS_M, starts)
+        tested = calibrated_drive(calibration, recording, "calibration", with_gyro=turned, refit_sensors=refit)
+        return ends, tested.drive.errors(Trials(starts, ends)).position
+
+    whole, part = fit(log, config), fit(cut(log, 45.0), config)
+    # a delay of the wheels is read from samples until half a second later
+    last = len(part.table) - 50
+    for turned in (False, True):
+        _, known = errors(whole, turned=turned)
+        ends, cut_short = errors(part, turned=turned)
+        tried = (ends >= 0) & (ends < last)
+        assert np.count_nonzero(tried) > 100
+        assert np.abs(known[: len(ends)][tried] - cut_short[tried]).max() < ROUNDING_M
+        with_future, without = (errors(run, turned=turned, refit=True)[1] for run in (whole, part))
+        assert np.abs(with_future[: len(ends)][tried] - without[tried]).max() > ROUNDING_M

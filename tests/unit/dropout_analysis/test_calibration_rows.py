@@ -12,7 +12,8 @@ import pandas as pd
 import pytest
 
 import icrtool
-from icrtool.calibration.pooled import predictor, recording_of
+from icrtool.calibration.calibration_rows import calibrated_drive
+from icrtool.calibration.pooled import recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.dropout_analysis import trials
 from icrtool.dropout_analysis.dropout_report import dropout_report
@@ -55,7 +56,7 @@ def test_a_calibration_is_tested_in_the_trials_of_the_other_rows(
 ) -> None:
     recording = recording_of(drive)
     trials = cut_trials(recording, HORIZONS)
-    expected = error_summary(predictor(own, recording)(trials).position)
+    expected = error_summary(calibrated_drive(own, recording, "calibration").drive.errors(trials).position)
     for name in ("calibration:own", "calibration:last.season"):
         result = report.result(name)
         assert result is not None

@@ -1,0 +1,141 @@
+"""Rows ``calibration`` of a report: calibrations that were given, tested in a log with their sensors' constants."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.calibration.adaptive_rows import KnownDrive
+from icrtool.calibration.held_sensors import (
+    CONSTANT_WORDS,
+    LEARNED,
+    constants_document,
+    contradictions,
+    left_of,
+    measured_in,
+    pooled_constants,
+    words_of,
+)
+from icrtool.calibration.pooled import model_for
+from icrtool.calibration.record import Calibration
+from icrtool.errors import DataError
+from icrtool.motion.adaptive import Learned
+from icrtool.motion.models import FittedModel
+from icrtool.motion.recording import LogConstants, Recording, cut_windows, past_lines, predicted_path
+from icrtool.motion.window_fit import own_constants
+from icrtool.records.calibration_document import HeldSensors
+from icrtool.records.notes import Note
+from icrtool.records.rows import PAST
+
+
+class CalibratedDrive(NamedTuple):
+    """A calibration in a log that it is tested on.
+
+    Attributes
+    ----------
+    drive : the log, and the model and constants that were known at each time of it
+    sensors : the constants that it holds, and those of the log
+    knows : where its constants come from, in words
+    notes : constants that the log contradicts
+    """
+
+    drive: KnownDrive
+    sensors: HeldSensors
+    knows: str
+    notes: tuple[Note, ...]
+
+
+def calibrated_drive(
+    calibration: Calibration,
+    recording: Recording,
+    row: str,
+    past: Recording | None = None,
+    *,
+    with_gyro: bool = False,
+    refit_sensors: bool = False,
+) -> CalibratedDrive:
+    """Return a calibration in a recording.
+
+    Parameters
+    ----------
+    row : name of its row
+    past : the recording with the poses that were known when it was driven; default: its own
+    with_gyro : with the recording's gyro
+    refit_sensors : the constants are those of the whole recording, and none are held
+
+    Raises
+    ------
+    ConfigError
+        As of `model_for`.
+    DataError
+        The drive is too short to find constants that the calibration does not hold.
+
+    Notes
+    -----
+    Constants are held in total, corrections before the fit included: what this log had corrected is subtracted. The
+    bias of a gyro is learned from the turns before each start, from the held one on.
+    """
+    fitted = model_for(calibration, recording, with_gyro=with_gyro)
+    total = pooled_constants(calibration.logs, recording.heading_source, with_gyro=with_gyro)
+    measured = None
+    with suppress(DataError):
+        measured = constants_document(measured_in(recording, cut_windows(recording), fitted))
+    sensors = HeldSensors(constants_document(total), measured, refit_sensors)
+    names = [name for name in CONSTANT_WORDS if with_gyro or not name.startswith("gyro")]
+    if refit_sensors:
+        own = own_constants(cut_windows(recording), fitted, recording.width_m)
+        knows = f"{words_of(names)} refitted in this drive (--refit-sensors)"
+        return CalibratedDrive(KnownDrive(recording, (_learned(fitted, own),)), sensors, knows, ())
+    left = left_of(total, recording.corrected)
+    unknown = [name for name in names if getattr(sensors.held, name) is None]
+    # a model without a gyro uses no constants of it
+    constants = left.usual().mean
+    if unknown:
+        constants = own_constants(cut_windows(recording), fitted, recording.width_m, left.mean)
+    learned: tuple[Learned, ...] = (_learned(fitted, constants),)
+    if with_gyro:
+        usual = left.usual()
+        constants = constants._replace(gyro_bias_radps=usual.mean.gyro_bias_radps)
+        learned = _with_biases(recording if past is None else past, fitted, constants, usual.std.gyro_bias_radps)
+    knows = _knows([name for name in names if name not in unknown], unknown)
+    # both rows of a calibration hold offset and delay: a contradiction is noted once
+    notes = contradictions(row, sensors, ["gyro_delay_s"] if with_gyro else names)
+    return CalibratedDrive(KnownDrive(recording, learned), sensors, knows, tuple(notes))
+
+
+def _knows(held: Sequence[str], unknown: Sequence[str]) -> str:
+    """Return in words where constants come from."""
+    parts = []
+    if shown := [name for name in held if name != LEARNED]:
+        parts.append(f"{words_of(shown)} held")
+    if fitted := [name for name in unknown if name != LEARNED]:
+        parts.append(f"{words_of(fitted)} from this drive, as the calibration has none")
+    if LEARNED in (*held, *unknown):
+        parts.append(f"{words_of([LEARNED])} from {PAST}")
+    return ", ".join(parts)
+
+
+def _learned(fitted: FittedModel, constants: LogConstants, since_s: float = -np.inf) -> Learned:
+    """Return a model and constants as known from a time on."""
+    return Learned(since_s, 0.0, fitted, constants)
+
+
+def _with_biases(
+    past: Recording, fitted: FittedModel, constants: LogConstants, std_radps: float
+) -> tuple[Learned, ...]:
+    """Return a model with a gyro and constants, with the bias that the turns before each start show.
+
+    Parameters
+    ----------
+    constants : its bias is the bias before the drive; `std_radps` : standard deviation of that
+    """
+    path = predicted_path(past, fitted, constants)
+    lines = past_lines(past.track, lambda rows: path(past.track.t[rows])[0], (0.0, std_radps))
+    known_s = [-np.inf, *past.track.t[lines.row[1:]].tolist()]
+    return tuple(
+        _learned(fitted, constants._replace(gyro_bias_radps=constants.gyro_bias_radps + bias), since_s)
+        for since_s, bias in zip(known_s, lines.bias_radps.tolist(), strict=True)
+    )

@@ -1,0 +1,189 @@
+"""Constants of the sensors in a calibration: measured in each of its logs, pooled, and held in a further log.
+
+A robot's sensors are installed once. Heading offset and delays of a log are what was corrected before the fit and what
+the windows show on top, so that logs with different corrections can be compared. A calibration holds their mean over
+its logs, with the spread between drives. The bias of a gyro changes with its temperature: a row with a gyro learns it
+from the drive before each start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.error_statistics import between_variance, pooled_variance
+from icrtool.kernels.track import Windows
+from icrtool.motion.models import FittedModel
+from icrtool.motion.recording import GYRO_START_STD, LogConstants, Recording
+from icrtool.motion.window_fit import KnownConstants, measured_constants
+from icrtool.records import calibration_document as documents
+from icrtool.records.notes import Note, note
+
+FEWEST_POOLED = 3
+"""Number of logs from which on the spread between drives is estimated."""
+
+BETWEEN_DRIVES_STD = LogConstants(math.radians(0.5), 0.02, GYRO_START_STD[1], 0.02)
+"""Standard deviations of the constants between drives of one robot, before its logs show them [rad, s, rad/s, s].
+
+An installation does not change. What remains is how ground and speed change the robot's response to its wheels, and the
+temperature of a gyro."""
+
+SENSOR_SIGMAS = 3.0
+"""Difference between a held constant and a log's own, in standard deviations, from which on the log contradicts it."""
+
+_TO_DOCUMENT = np.array([math.degrees(1.0), -1.0, math.degrees(1.0), 1.0])
+"""Factors from `LogConstants` to the numbers of `SensorConstants`."""
+
+
+def sensors_of(
+    recording: Recording, windows: Windows, fitted: FittedModel, turned: FittedModel | None = None
+) -> documents.LogSensors:
+    """Return the constants of a recording's sensors, corrections before the fit included.
+
+    Parameters
+    ----------
+    windows : of the recording
+    fitted, turned : models of the calibration, with wheels alone and with a gyro
+    """
+    of_models = [
+        None if one is None else constants_document(measured_in(recording, windows, one)) for one in (fitted, turned)
+    ]
+    return documents.LogSensors(recording.heading_source, of_models[0] or documents.SensorConstants(), of_models[1])
+
+
+def measured_in(recording: Recording, windows: Windows, fitted: FittedModel) -> KnownConstants:
+    """Return the constants that a recording's sensors had before any correction, for a model's parameters."""
+    found = measured_constants(windows, fitted, recording.width_m)
+    return KnownConstants(recording.corrected.plus(found.mean), found.std)
+
+
+def constants_document(known: KnownConstants) -> documents.SensorConstants:
+    """Return constants as a document, in the units and signs of the configuration."""
+    values, stds = np.array(known.mean) * _TO_DOCUMENT, np.array(known.std) * np.abs(_TO_DOCUMENT)
+    pairs = zip(documents.SensorConstants.__struct_fields__, values.tolist(), stds.tolist(), strict=True)
+    return documents.SensorConstants(
+        **{name: documents.MeasuredConstant(value, std) for name, value, std in pairs if math.isfinite(value + std)}
+    )
+
+
+def known_constants(document: documents.SensorConstants) -> KnownConstants:
+    """Return the constants of a document; NaN where it has none."""
+    both = np.full((2, len(_TO_DOCUMENT)), np.nan)
+    for column, name in enumerate(documents.SensorConstants.__struct_fields__):
+        one: documents.MeasuredConstant | None = getattr(document, name)
+        if one is not None:
+            both[:, column] = one.value / _TO_DOCUMENT[column], one.std / abs(_TO_DOCUMENT[column])
+    return KnownConstants(*(LogConstants(*row) for row in both.tolist()))
+
+
+def pooled_constants(
+    logs: Sequence[documents.CalibrationLog], heading_source: str | None = None, *, with_gyro: bool = False
+) -> KnownConstants:
+    """Return what the logs of a calibration give for the constants of a further drive; NaN where they give nothing.
+
+    Parameters
+    ----------
+    heading_source : of the further drive. A heading of another source has another offset, which is not used. None: the
+        source of the logs, if it is one
+    with_gyro : for the model with a gyro
+
+    Notes
+    -----
+    The mean of the logs, weighted by their variances and the variance between drives; the standard deviation is that of
+    a further drive. The variance between drives is the variance of the logs beyond their own uncertainty
+    (`between_variance`), pooled with `BETWEEN_DRIVES_STD`, which stands alone for one or two logs.
+    """
+    stored = [one.sensors for one in logs if one.sensors is not None]
+    sources = {one.heading_source for one in stored}
+    if heading_source is None and len(sources) == 1:
+        (heading_source,) = sources
+    of_logs = [(one.heading_source, one.gyro if with_gyro else one.wheels) for one in stored]
+    known = [(source, known_constants(one)) for source, one in of_logs if one is not None]
+    pairs = []
+    for column, usual_std in enumerate(BETWEEN_DRIVES_STD):
+        of_offset = column == 0
+        some = np.array([
+            (one.mean[column], one.std[column])
+            for source, one in known
+            if math.isfinite(one.mean[column]) and not (of_offset and source != heading_source)
+        ])  # fmt: skip
+        if of_offset and len(some):
+            # angles about the first one
+            some[:, 0] -= 2.0 * np.pi * np.round((some[:, 0] - some[0, 0]) / (2.0 * np.pi))
+        pairs.append(_further(some, usual_std) if len(some) else (math.nan, math.nan))
+    mean, std = zip(*pairs, strict=True)
+    return KnownConstants(LogConstants(*mean), LogConstants(*std))
+
+
+def _further(found: Floats, usual_std: float) -> tuple[float, float]:
+    """Return mean and standard deviation of a further drive, from those of drives (k, 2)."""
+    (values, std), usual = found.T, usual_std**2
+    variances, between = std**2, usual
+    if len(values) >= FEWEST_POOLED:
+        measured = between_variance(values, np.maximum(variances, np.finfo(np.float64).tiny))
+        between = pooled_variance(measured, len(values) - 1.0, usual)[0]
+    weights = 1.0 / (variances + between)
+    total = float(weights.sum())
+    return float(weights @ values) / total, math.sqrt(1.0 / total + between)
+
+
+def left_of(total: KnownConstants, corrected: LogConstants) -> KnownConstants:
+    """Return what is left of constants after corrections that were made before; NaN where they are not known."""
+    return total._replace(mean=total.mean.minus(corrected))
+
+
+CONSTANT_WORDS = {
+    "heading_offset_deg": ("heading offset", "°", 2),
+    "reference_delay_s": ("delay of the poses behind the wheels", " s", 3),
+    "gyro_bias_degps": ("gyro bias", "°/s", 2),
+    "gyro_delay_s": ("delay of the gyro behind the wheels", " s", 3),
+}
+"""Words, unit and decimals of each of `SensorConstants`."""
+
+LEARNED = "gyro_bias_degps"
+"""The constant that a row learns from the drive before each start in place of holding it."""
+
+
+def words_of(names: Iterable[str]) -> str:
+    """Return the words of some of `SensorConstants`."""
+    return ", ".join(CONSTANT_WORDS[name][0] for name in names)
+
+
+def constant_text(constants: documents.SensorConstants, name: str) -> str:
+    """Return a constant with its standard deviation and unit; empty where it is not known."""
+    one: documents.MeasuredConstant | None = getattr(constants, name)
+    _, unit, digits = CONSTANT_WORDS[name]
+    return "" if one is None else f"{one.value:+z.{digits}f} ± {one.std:.{digits}f}{unit}"
+
+
+def contradictions(row: str, sensors: documents.HeldSensors, among: Iterable[str]) -> list[Note]:
+    """Return a note for each constant that a row holds and its log contradicts.
+
+    Parameters
+    ----------
+    row : its name
+    among : of `SensorConstants`
+    """
+    notes = list[Note]()
+    if sensors.measured is None:
+        return notes
+    for name in among:
+        held: documents.MeasuredConstant | None = getattr(sensors.held, name)
+        own: documents.MeasuredConstant | None = getattr(sensors.measured, name)
+        if held is None or own is None:
+            continue
+        words, unit, _ = CONSTANT_WORDS[name]
+        apart = math.remainder(own.value - held.value, 360.0) if unit == "°" else own.value - held.value
+        std = math.hypot(held.std, own.std)
+        if abs(apart) > SENSOR_SIGMAS * std:
+            both = (
+                f"holds {constant_text(sensors.held, name)} and this log shows {constant_text(sensors.measured, name)}"
+            )
+            why = f"{words}: the calibration {both}, {abs(apart) / std:.1f} σ apart"
+            what = "its errors hold this difference; --refit-sensors takes the constants of this log"
+            advice = "calibrate again if a sensor was moved or a clock has changed"
+            notes.append(note("sensors_contradict_calibration", f"row {row}: {why}: {what}; {advice}"))
+    return notes
