@@ -38,6 +38,7 @@ from icrtool.records.text import LogText
 from support.barn import TRACK_WIDTH_M, configured, simulate
 from support.browser import Browser, Page, browser, chromium
 from support.documents import with_summary
+from support.open_loop_vector import HELD_S, ICRS_M, PATH, V_LEFT_MPS, V_RIGHT_MPS
 from support.recordings import table_errors
 
 HOSTILE = "</script><script>window.hostile=1</script><img src=x onerror='window.hostile=1'>\"'"
@@ -252,6 +253,24 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
                 assert errors[name][h] == pytest.approx(error, abs=1e-4 if name == "icr" else 3e-4), (name, start, h)
         for name, of_model in along.items():
             assert errors[name] == pytest.approx(of_model[number].tolist(), abs=1e-4), (name, start)
+
+
+def test_the_script_of_a_page_drives_the_shared_vector_to_its_end(page: Page) -> None:
+    left, right = (np.append(0.0, np.cumsum(HELD_S * speed)[:-1]).tolist() for speed in (V_LEFT_MPS, V_RIGHT_MPS))
+    nowhere = [0.0] * len(PATH)
+    steps = {"left": left, "right": right, "joined": 1, "distance": list(range(len(PATH))), "gaps": [],
+             "north": nowhere, "east": nowhere, "without_reference": []}  # fmt: skip
+    series = {"step": [0], "heading": [PATH[0, 2]], "y_right": [ICRS_M[0]], "y_left": [ICRS_M[1]], "x": [ICRS_M[2]]}
+    data = json.dumps({"steps": steps, "series": series, "models": [{"name": "icr"}], "paths": {}})
+    lengths = list(range(1, len(PATH)))
+    [model] = page.evaluate(f"icrtoolOpenLoop.drive({data}, 0, {lengths}).models")
+    moved = PATH[1:, :2] - PATH[0, :2]
+    assert model["errors"] == pytest.approx(np.hypot(*moved.T).tolist(), abs=1e-12)
+    ends = page.evaluate(
+        f"(({{north, east}}) => [...north].map((n, k) => [n, east[k]]))"
+        f"(icrtoolOpenLoop.drive({data}, 0, {lengths}).models[0].path)"
+    )
+    assert np.array(ends) == pytest.approx(PATH[:, :2] - PATH[0, :2], abs=1e-12)
 
 
 def test_paths_of_joined_samples_are_close_to_those_of_the_library(

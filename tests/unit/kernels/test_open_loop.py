@@ -9,6 +9,7 @@ import pytest
 from icrtool.kernels import open_loop
 from icrtool.kernels.open_loop import open_loop_errors, open_loop_errors_direct, open_loop_path
 from icrtool.kernels.track import GAP, OUTAGE, SHORT, FrozenIcrs, Track, count_trials, trial_ends
+from support.open_loop_vector import HELD_S, ICRS_M, PATH, V_LEFT_MPS, V_RIGHT_MPS
 
 EQUAL_M = 1e-9  # what the fast algorithm promises against the direct integration
 ROUNDING = 1e-12  # two orders of the same few hundred additions of metres and radians
@@ -274,3 +275,21 @@ class TestKernelsAgainstTheirPythonFunction:
         for name in ("sum_moments", "fill_errors"):
             monkeypatch.setattr(open_loop, name, getattr(open_loop, name).py_func)
         np.testing.assert_allclose(open_loop_errors(drive, icrs, ends), compiled, rtol=0.0, atol=ROUNDING)
+
+
+def test_every_trial_of_the_shared_vector_ends_where_it_states() -> None:
+    origin, n = np.zeros(len(PATH)), len(PATH)
+    # The reference stays at the origin: an error is the distance from there.
+    track = Track.of_states(
+        np.concatenate([[0.0], np.cumsum(HELD_S)[:-1]]), HELD_S, V_LEFT_MPS, V_RIGHT_MPS, origin, origin,
+        np.full(n, PATH[0, 2]), np.arange(n, dtype=np.float64),
+    )  # fmt: skip
+    path = open_loop_path(track, *ICRS_M, 0, n - 1)
+    moved = PATH[:, :2] - PATH[0, :2]
+    np.testing.assert_allclose(np.column_stack([path.north, path.east]), moved, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(path.heading, PATH[:, 2], rtol=0, atol=ROUNDING)
+    ends = np.full((n, n - 1), SHORT)
+    ends[0] = np.arange(1, n)
+    for errors in (open_loop_errors, open_loop_errors_direct):
+        found = errors(track, FrozenIcrs.constant(*ICRS_M), ends)
+        np.testing.assert_allclose(found[0], np.hypot(*moved[1:].T), rtol=0, atol=EQUAL_M)
