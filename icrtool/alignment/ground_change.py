@@ -1,8 +1,9 @@
-"""A change of ground during a drive: the turn of the robot per turn of its wheels differs between two stretches."""
+"""Changes of ground during a drive: the turn of the robot per turn of its wheels differs between stretches."""
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -10,15 +11,19 @@ import numpy as np
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.sparse_reference import spans_of_measured
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.records.measurements import GroundStretch
 
 CHANGE_WINDOW_S, CHANGE_GROUP_S = 2.0, 10.0
 """Time over which turns are compared, and time within which windows count as one observation [s]."""
 
 FEWEST_CHANGE_GROUPS, CHANGE_CANDIDATES = 4, 60
-"""Smallest number of groups with a turn in a stretch, and number of times of the change that are compared."""
+"""Smallest number of groups with a turn in a stretch, and number of times of a change that are compared."""
+
+MOST_CHANGES = 3
+"""Largest number of changes of ground in a drive."""
 
 CHANGE_SIGMAS, CHANGE_SHARE = 5.0, 0.1
-"""Stretches differ where by more than both: the best of many candidates differs by
+"""Stretches that follow each other differ where by more than both: the best of many candidates differs by
 more than 3 sigma by chance, and few groups show a deviation that is itself uncertain."""
 
 LEAST_MULTIPLIER = 0.8
@@ -29,37 +34,86 @@ CHANGE_GAIN = 25.0
 """Twice the log-likelihood that a change gains, with an observation for two windows, which overlap: five sigma."""
 
 
-class GroundChange(NamedTuple):
-    """The most likely change.
+class GroundChanges(NamedTuple):
+    """The most likely changes.
 
     Attributes
     ----------
-    t_s : since the first wheel sample [s]
-    before, after : multiplier of the track width, and its standard deviation
+    stretches : of one ground each, two or more, in order of time
     """
 
-    t_s: float
-    before: tuple[float, float]
-    after: tuple[float, float]
+    stretches: tuple[GroundStretch, ...]
+
+    @property
+    def times_s(self) -> tuple[float, ...]:
+        """Times of the changes, since the first wheel sample [s]."""
+        return tuple(one.begin_s for one in self.stretches[1:])
 
     @property
     def text(self) -> str:
         """What was found, and what to do."""
-        stretches = " and ".join(f"{value:.3f} ± {max(std, 0.001):.3f}" for value, std in (self.before, self.after))
+        values = _joined([f"{one.multiplier:.3f} ± {max(one.multiplier_std, 0.001):.3f}" for one in self.stretches])
+        when = _joined([f"{t:.0f} s" for t in self.times_s])
+        options = " ".join(f"--terrain-change {t:.0f}" for t in self.times_s)
+        where, fits, states = ("before and after", "neither", "states it")
+        if len(self.times_s) > 1:
+            where, fits, states = ("in the stretches", "none", "state them")
         return (
-            f"the ground changes at about {self.t_s:.0f} s: multiplier {stretches} before and after; one number "
-            f"fits neither: --terrain-change {self.t_s:.0f} states it to the filter, --from and --to fit each stretch"
+            f"the ground changes at about {when}: multiplier {values} {where}; one number "
+            f"fits {fits}: {options} {states} to the filter, --from and --to fit each stretch"
         )
 
 
-def find_change(fit: AlignmentFit) -> GroundChange | None:
-    """Return the change of ground of a drive; None where the drive shows no change.
+def _joined(texts: list[str]) -> str:
+    """Return texts with commas, and the last one after "and"."""
+    return " and ".join([", ".join(texts[:-1]), texts[-1]] if len(texts) > 1 else texts)
+
+
+class _Turns(NamedTuple):
+    """Begins of windows (n,) [s], turn of the wheels and of the heading in them [rad], their group of time."""
+
+    begin: Floats
+    x: Floats
+    y: Floats
+    group: Ints
+
+    def rows(self, first: int, stop: int) -> _Turns:
+        """Return some of the windows."""
+        return _Turns._make(column[first:stop] for column in self)
+
+
+def find_changes(fit: AlignmentFit) -> GroundChanges | None:
+    """Return the changes of ground of a drive; None where the drive shows none.
 
     Notes
     -----
-    Least squares of the heading's turn by the wheels' turn, before and after each of some times; deviations by groups
-    of time (White 1980; Liang and Zeger 1986).
+    Least squares of the heading's turn by the wheels' turn in each stretch, with the best times for each number of
+    changes (dynamic programming: Bellman and Roth 1969); a change is worth `CHANGE_GAIN`. Deviations by groups of time
+    (White 1980; Liang and Zeger 1986). Each stretch must show its ratio, and differ from the next one.
     """
+    turns = _turns(fit)
+    if turns is None:
+        return None
+    weight = np.cumsum(turns.x**2)
+    if not len(turns.x) or weight[-1] <= 0.0:
+        return None
+    places = np.unique(np.searchsorted(weight, np.linspace(0.0, 1.0, CHANGE_CANDIDATES + 2) * weight[-1]))
+    places = np.unique(np.concatenate([[0], places[(places > 0) & (places < len(turns.x))], [len(turns.x)]]))
+    ways, costs = _best_partitions(turns, places)
+    likelihood = [len(turns.x) / 2 * math.log(max(cost, 1e-12)) for cost in costs]
+    # the most likely number of changes first; the others where its stretches do not show themselves
+    ranked = sorted(range(len(ways)), key=lambda count: likelihood[count] + CHANGE_GAIN * count)
+    for count in ranked:
+        if count == 0:
+            return None
+        stretches = _stretches(turns, ways[count])
+        if stretches is not None:
+            return GroundChanges(stretches)
+    return None
+
+
+def _turns(fit: AlignmentFit) -> _Turns | None:
+    """Return turns of wheels and heading; None with too few windows."""
     track, delay = fit.windows.track, fit.estimate("heading_delay")[0]
     turned = track.cumulate(2.0 * track.half_difference / fit.width_m)
     first, last = max(track.t[0] + delay, track.heading_t[0]), min(track.t[-1] + delay, track.heading_t[-1])
@@ -75,40 +129,73 @@ def find_change(fit: AlignmentFit) -> GroundChange | None:
     y = track.heading_at(end) - track.heading_at(begin)
     kept = track.clear(begin - delay, end - delay)
     begin, x, y = begin[kept], x[kept], y[kept]
-    group = np.floor(begin / CHANGE_GROUP_S).astype(np.int64)
-    weight = np.cumsum(x**2)
-    if not len(x) or weight[-1] <= 0.0:
-        return None
-    places = np.unique(np.searchsorted(weight, np.linspace(0.1, 0.9, CHANGE_CANDIDATES) * weight[-1]))
-    whole = float(np.sum((y - x * float(x @ y) / weight[-1]) ** 2))
-    best, found = math.inf, None
-    for place in places.tolist():
-        parts = [_ratio(x[rows], y[rows], group[rows]) for rows in (slice(0, place), slice(place, None))]
-        if None in parts:
-            continue
-        (first, first_std, left), (second, second_std, right) = (one for one in parts if one is not None)
-        if left + right < best:
-            best, found = left + right, (place, (first, first_std), (second, second_std))
-    if found is None or len(x) / 2 * math.log(max(whole, 1e-12) / max(best, 1e-12)) < CHANGE_GAIN:
-        return None
-    place, before, after = found
-    apart = abs(before[0] - after[0])
-    if apart < max(CHANGE_SIGMAS * math.hypot(before[1], after[1]), CHANGE_SHARE * max(before[0], after[0])):
-        return None
-    if not 0.0 < min(before[0], after[0]) <= max(before[0], after[0]) < 1.0 / LEAST_MULTIPLIER:
-        return None
-    stated = [(1.0 / ratio, std / ratio**2) for ratio, std in (before, after)]
-    return GroundChange(float(begin[place]), stated[0], stated[1])
+    return _Turns(begin, x, y, np.floor(begin / CHANGE_GROUP_S).astype(np.int64))
 
 
-def _ratio(x: Floats, y: Floats, group: Ints) -> tuple[float, float, float] | None:
-    """Return turn per turn of the wheels, its deviation, and the sum of squares left; None with too few groups."""
-    turns = np.unique(group[np.abs(x) > math.radians(5.0)])
+def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list[float]]:
+    """Return for 0, 1, ... changes the rows that divide the windows, both ends included, and the sum of squares left.
+
+    Parameters
+    ----------
+    places : (p,) rows at which a stretch may begin or end, ascending
+    """
+    sums = [np.append(0.0, np.cumsum(one))[places] for one in (turns.x**2, turns.x * turns.y, turns.y**2)]
+    groups = np.searchsorted(np.unique(turns.group), turns.group)
+    enough = np.append(groups, groups[-1] + 1)[places]
+
+    def left(first: Ints, stop: int) -> Floats:
+        xx, xy, yy = (total[stop] - total[first] for total in sums)
+        short = (enough[stop] - enough[first] < FEWEST_CHANGE_GROUPS) | (xx <= 0.0)
+        return np.where(short, np.inf, np.maximum(yy - xy**2 / np.where(xx > 0.0, xx, 1.0), 0.0))
+
+    count = len(places)
+    best = np.array([np.inf, *(float(left(np.array([0]), stop)[0]) for stop in range(1, count))])
+    came, ways, costs = list[Ints](), list[list[int]](), list[float]()
+    for changes in range(MOST_CHANGES + 1):
+        if changes:
+            by_first = [best[:stop] + left(np.arange(stop), stop) for stop in range(1, count)]
+            came.append(np.array([0, *(int(np.argmin(one)) for one in by_first)]))
+            best = np.array([np.inf, *(float(one.min()) for one in by_first)])
+        if not math.isfinite(best[-1]):
+            break
+        at, rows = count - 1, [count - 1]
+        for before in reversed(came):
+            at = int(before[at])
+            rows.append(at)
+        ways.append([0, *(int(places[row]) for row in reversed(rows))])
+        costs.append(float(best[-1]))
+    return ways, costs
+
+
+def _stretches(turns: _Turns, rows: list[int]) -> tuple[GroundStretch, ...] | None:
+    """Return the stretches between rows, None where one does not show its multiplier or equals the next one."""
+    found, ratios = list[GroundStretch](), list[tuple[float, float]]()
+    for first, stop in pairwise(rows):
+        part = turns.rows(first, stop)
+        shown = _ratio(part)
+        if shown is None or not 0.0 < shown[0] < 1.0 / LEAST_MULTIPLIER:
+            return None
+        ratio, std = shown
+        ratios.append(shown)
+        end = turns.begin[stop] if stop < len(turns.begin) else turns.begin[-1] + CHANGE_WINDOW_S
+        begin = 0.0 if not found else float(turns.begin[first])
+        known = {"multiplier": 1.0 / ratio, "multiplier_std": std / ratio**2}
+        found.append(GroundStretch(begin_s=begin, end_s=float(end), **known))
+    for (before, before_std), (after, after_std) in pairwise(ratios):
+        least = max(CHANGE_SIGMAS * math.hypot(before_std, after_std), CHANGE_SHARE * max(before, after))
+        if abs(before - after) < least:
+            return None
+    return tuple(found)
+
+
+def _ratio(turns: _Turns) -> tuple[float, float] | None:
+    """Return turn per turn of the wheels, and its deviation; None with too few groups."""
+    x, y = turns.x, turns.y
+    turning = np.unique(turns.group[np.abs(x) > math.radians(5.0)])
     square = float(x @ x)
-    if len(turns) < FEWEST_CHANGE_GROUPS or square <= 0.0:
+    if len(turning) < FEWEST_CHANGE_GROUPS or square <= 0.0:
         return None
     ratio = float(x @ y) / square
-    left = y - ratio * x
-    _, row = np.unique(group, return_inverse=True)
-    sums = np.bincount(row, x * left)
-    return ratio, math.sqrt(float(sums @ sums) * len(turns) / (len(turns) - 1)) / square, float(left @ left)
+    _, row = np.unique(turns.group, return_inverse=True)
+    sums = np.bincount(row, x * (y - ratio * x))
+    return ratio, math.sqrt(float(sums @ sums) * len(turning) / (len(turning) - 1)) / square

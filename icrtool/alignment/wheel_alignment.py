@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit, residuals_by_estimate
-from icrtool.alignment.ground_change import find_change
+from icrtool.alignment.ground_change import find_changes
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.alignment.sparse_reference import spans_of_measured
@@ -176,7 +176,7 @@ def align_wheels(
     sound : no side is dead or a copy of the other
     """
     wheels, notes, applied = log.wheels, list[Note](), (1.0, 1.0)
-    change = None if fit is None or not sound else find_change(fit)
+    change = None if fit is None or not sound else find_changes(fit)
     filtered = "" if fit is None or not sound or change is not None else find_filtering(fit)
     if fit is not None and not filtered:
         applied, notes = _find_scales(fit, config, sound=sound)
@@ -203,7 +203,8 @@ def align_wheels(
         residual_m=None if fit is None else known(math.hypot(*fit.fit.scale[[0, windows]].tolist())),
         turn_left=known(turn_left),
         turn_left_std=known(turn_left_std),
-        ground_change_s=None if change is None else change.t_s,
+        ground_change_s=None if change is None else change.times_s[0],
+        ground_stretches=() if change is None else change.stretches,
     )
     notes += [] if change is None else [note("ground_changed", change.text)]
     return facts, applied, [*notes, *_fused_note(log, config.wheels.twist_width_m or config.robot.track_width_m)]

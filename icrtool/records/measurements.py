@@ -176,6 +176,21 @@ class FixStatistics:
     step_std_m: dict[str, float]
 
 
+class GroundStretch(Record, frozen=True, kw_only=True):
+    """A stretch of a drive on one ground.
+
+    Attributes
+    ----------
+    begin_s, end_s : since the first wheel sample [s]
+    multiplier, multiplier_std : turn of the wheels per turn of the robot, and its standard deviation
+    """
+
+    begin_s: float
+    end_s: float
+    multiplier: float
+    multiplier_std: float
+
+
 class WheelFacts(Record, frozen=True, kw_only=True):
     """What is known of the wheels, and what was done with it; as ``wheels`` in run.json.
 
@@ -190,7 +205,8 @@ class WheelFacts(Record, frozen=True, kw_only=True):
     residual_m : robust standard deviation of their displacements; None without windows
     turn_left, turn_left_std : share of the variance of the robot's turns over a second that the wheels do not explain,
         1 - R^2, and its standard deviation; None without windows
-    ground_change_s : when the ground changes, since the first wheel sample; None where it does not
+    ground_change_s : when the ground first changes, since the first wheel sample; None where it does not
+    ground_stretches : the stretches between changes of ground; none where it does not change
     """
 
     scale: float | None
@@ -206,6 +222,7 @@ class WheelFacts(Record, frozen=True, kw_only=True):
     turn_left: float | None = None
     turn_left_std: float | None = None
     ground_change_s: float | None = None
+    ground_stretches: tuple[GroundStretch, ...] = ()
 
 
 class HeadingFacts(Record, frozen=True, kw_only=True):

@@ -108,8 +108,9 @@ def run_blocks(summary: RunDocument) -> list[Block]:
 def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
     """Return where a run was written, and what to do next; `examine`: command that names what is wrong in its log."""
     command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
-    if (change_s := summary.wheels.ground_change_s) is not None and summary.inputs and not summary.request.changes_s:
-        command = shlex.join(["icrtool", "fit", summary.inputs[0].path, "--terrain-change", f"{change_s:.0f}"])
+    if (stretches := summary.wheels.ground_stretches) and summary.inputs and not summary.request.changes_s:
+        times = [word for one in stretches[1:] for word in ("--terrain-change", f"{one.begin_s:.0f}")]
+        command = shlex.join(["icrtool", "fit", summary.inputs[0].path, *times])
     drive = advice(summary)
     return [Section("", [Facts([("written to", place), ("next", drive)]), next_line("" if drive else command)])]
 
@@ -363,3 +364,8 @@ def _icr_tables(summary: RunDocument) -> Iterator[Table]:
         segments.append((f"  {number}", f"{segment.begin_s:.1f} s", *texts))
     head = ("segment", "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
     yield Table("lr", segments, head)
+    grounds = [
+        (f"  {number}", f"{one.begin_s:.0f} s", f"{one.end_s:.0f} s", plus_minus(one.multiplier, one.multiplier_std))
+        for number, one in enumerate(summary.wheels.ground_stretches, start=1)
+    ]
+    yield Table("lrrr", grounds, ("ground", "begins", "ends", "multiplier ± σ by the turns"))

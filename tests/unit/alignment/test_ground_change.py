@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,22 +19,29 @@ CONFIG = load_config(sets=[f"robot.track_width_m={WIDTH_M}"])
 BEFORE = (ICRS[0] - ICRS[1]) / WIDTH_M
 
 
-def with_change(factor: float, at_s: float, seconds: float = 240.0) -> RobotLog:
-    """Return a drive whose y ICRs are `factor` times as far apart from a time on.
+def with_changes(changes: list[tuple[float, float]], seconds: float, seed: int = 0) -> RobotLog:
+    """Return a drive whose y ICRs are some factor times as far apart from each time on.
 
     The sides' difference is divided by it, their mean kept: the same path with other wheels.
     """
-    log = make_log(seconds=seconds)
+    log = make_log(seed, seconds=seconds)
     t = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
     left, right = log.wheels.v_left_mps, log.wheels.v_right_mps
     width = ICRS[0] - ICRS[1]
     # V = v + omega y for each side, of the same motion
     omega = (left - right) / width
     forward = (ICRS[0] * left - ICRS[1] * right) / width
-    y_right, y_left = (np.where(t < at_s, y, factor * y) for y in ICRS[:2])
+    factor = np.ones(len(t))
+    for one, at_s in changes:
+        factor[t >= at_s] = one
+    y_right, y_left = (factor * y for y in ICRS[:2])
     sides = forward - omega * y_left, forward - omega * y_right
     wheels = replace(log.wheels, left=sides[0], right=sides[1])
     return replace(log, wheels=wheels)
+
+
+def with_change(factor: float, at_s: float, seconds: float = 240.0) -> RobotLog:
+    return with_changes([(factor, at_s)], seconds)
 
 
 def test_the_wheels_of_an_unchanged_ground_are_those_of_the_log() -> None:
@@ -64,3 +72,38 @@ def test_a_drive_on_one_ground_shows_no_change() -> None:
     assert run.document.partly_because is None
     assert run.document.wheels.turn_left is not None
     assert run.document.wheels.turn_left < 0.05
+    assert run.document.wheels.ground_stretches == ()
+
+
+SEVERAL = [
+    [(0.75, 100.0), (1.0, 220.0)],
+    [(0.8, 110.0), (0.6, 210.0)],
+    [(1.25, 90.0), (0.9, 200.0)],
+    [(0.7, 80.0), (1.0, 160.0), (0.7, 240.0)],
+    [(0.8, 90.0), (0.6, 170.0), (1.1, 260.0)],
+]
+
+
+@pytest.mark.parametrize("changes", SEVERAL)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_and_three_changes_are_named_each_with_its_stretch(changes: list[tuple[float, float]], seed: int) -> None:
+    run = fit(with_changes(changes, 340.0, seed), CONFIG)
+    stretches = run.document.wheels.ground_stretches
+    assert len(stretches) == len(changes) + 1
+    for one, (factor, at_s) in zip(stretches, [(1.0, 0.0), *changes], strict=True):
+        assert one.begin_s == pytest.approx(at_s, abs=15.0)
+        assert abs(one.multiplier - factor * BEFORE) < max(4.0 * one.multiplier_std, 0.04)
+    for before, after in pairwise(stretches):
+        assert before.end_s == after.begin_s
+    (text,) = [one.text for one in run.document.notes if one.code == "ground_changed"]
+    assert text.count("--terrain-change") == len(changes)
+    assert text.count(" ± ") == len(stretches)
+    shown = format_run(run)
+    assert run.document.partly_because == text
+    assert all(f"{one.multiplier:.3f}" in shown for one in stretches)
+    assert "multiplier ± σ by the turns" in shown
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_drive_on_one_ground_has_one_stretch(seed: int) -> None:
+    assert fit(make_log(seed, seconds=340.0), CONFIG).document.wheels.ground_stretches == ()

@@ -87,13 +87,20 @@ def test_starts_that_are_no_trial_are_counted_by_kind(run: Run) -> None:
     assert report.states == len(table)
     distance, stamps = table.distance_m, table.stamp_ns
     (outage,) = run.outages_ns
+    place_std, psi_std = np.hypot(table.std_north_m, table.std_east_m), table.std_heading_rad
+    lost, after_gap = run.in_gap.copy(), False
+    for k in range(1, len(table)):
+        # states that are not known again after a gap are no start either
+        after_gap |= bool(run.in_gap[k - 1])
+        after_gap &= bool(place_std[k] > 2 * np.median(place_std) or psi_std[k] > 2 * np.median(psi_std))
+        lost[k] |= after_gap
     for h, horizon in enumerate(HORIZONS_M):
         kinds = {"trials": 0, "short": 0, "gap": 0, "outage": 0}
         for k in range(len(table)):
             far = np.flatnonzero(distance[k:] - distance[k] >= horizon)
             if not len(far):
                 kinds["short"] += 1
-            elif run.in_gap[k : k + far[0]].any():
+            elif lost[k : k + far[0]].any():
                 kinds["gap"] += 1
             elif outage[0] < stamps[k + far[0]] < outage[1]:
                 kinds["outage"] += 1
