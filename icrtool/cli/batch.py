@@ -107,7 +107,7 @@ def batch_command(
         new = any((row.status, row.this_time) == ("done", "processed") for row in rows)
         plots = batch.files.plots if new or not (folder / fleet_files.PLOTS).is_dir() else ()
         document = fleet_files.write_fleet(rows, folder, calibrations, plots, page=batch.files.page)
-        results = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")
+        results = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
         there = [name for name in results if (folder / name).exists()]
         written = ", ".join(f"{name}/" if (folder / name).is_dir() else name for name in there)
     if compared is not None:
@@ -120,7 +120,7 @@ def batch_command(
     printer.json("batch", replace(document, output=escaped(str(output))))
     printer.text(summary_of(rows, output, written))
     if calibrations:
-        printer.text(f"\n{fleet_files.calibrations_text(calibrations, tables=False)}".rstrip())
+        printer.text(f"\n{fleet_files.calibrations_text(calibrations)}".rstrip())
     options.check_compared(one for row in rows for one in row.verdicts)
     missed = any(row.gates_failed for row in rows)
     if missed or any(row.status == "failed" for row in rows):

@@ -53,7 +53,7 @@ about 1 GB of memory."""
 FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
 """Folders that a batch writes."""
 
-TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
+TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", FLEET_FILE)
 
 SHOWN_ERRORS = {MOST_USEFUL: documents.SHOWN_ERROR, WITHOUT_IT: documents.SHOWN_WITHOUT}
 """The rows whose errors the picture shows, and their columns: the first that a log has."""
@@ -146,8 +146,6 @@ def write_fleet(
     write_file(directory / "failures.csv", formats.csv_bytes(FAILURES, failures), directory)
     with atomic_file(directory / "fleet.parquet", directory) as file:
         _write_parquet(cells, file)
-    if calibrations:
-        write_file(directory / "calibrations.txt", calibrations_text(calibrations), directory)
     if plots:
         write_figures(rows, directory, plots)
     document = fleet_document(rows, calibrations)
@@ -160,22 +158,21 @@ def write_fleet(
     return document
 
 
-def calibrations_text(calibrations: Sequence[FleetCalibration], *, tables: bool = True) -> str:
-    """Return the pooled calibrations, one line each or with their leave-one-log-out tables."""
+def calibrations_text(calibrations: Sequence[FleetCalibration]) -> str:
+    """Return the pooled calibrations, one line each."""
     parts = []
     for one in calibrations:
         name = ", ".join(str(LogText(part)) for part in (one.robot, one.group) if part) or "all logs"
         head = f"{name}: {counted(len(one.logs), 'log')}"
         if one.left_out:
-            why = f" (not usable, copies, parts of another, or beyond {MOST_POOLED_S / 3600:.0f} h)"
-            head += f", {len(one.left_out)} not used{why if tables else ''}"
+            head += f", {len(one.left_out)} not used"
         if one.reason:
             head += f": no calibration: {escaped(one.reason)}"
         else:
             head += f": multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}{one.within_text}, in {one.file}"
         lines = textwrap.wrap(head, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
-        parts.append("\n".join(lines) if not tables else head if one.reason else f"{head}\n{one.table}")
-    return ("\n\n" if tables else "\n").join(parts) + "\n"
+        parts.append("\n".join(lines))
+    return "\n".join(parts) + "\n"
 
 
 def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Sequence[str]) -> None:

@@ -91,7 +91,7 @@ REPORT = Kind(
 
 
 def write_tables(report: DropoutReport, directory: Path) -> None:
-    """Write summary.csv, histogram.csv, worst.csv and report.json into a directory, and ladder.csv where there is one.
+    """Write summary.csv, histogram.csv, worst.csv and report.json into a directory.
 
     Raises
     ------
@@ -111,8 +111,6 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
         *columns, errors = msgspec.structs.astuple(trial)
         worst.append((rank, *columns, *(errors.get(model) for model in IN_CSV)))
     (directory / "worst.csv").write_bytes(csv_bytes(WORST_CSV_COLUMNS, worst))
-    if document.ladder.models:
-        (directory / "ladder.csv").write_bytes(csv_bytes(COMPARISON_COLUMNS, comparison_rows(document)))
     (directory / REPORT_FILE).write_bytes(json_bytes(document))
 
 
@@ -122,21 +120,6 @@ WORST_CSV_COLUMNS = (
     "rank", "model", "stamp_ns", "t_s", "north_m", "east_m", "horizon_m", "heading_change_deg", "speed_mean_mps",
     *(f"{model}_error_m" for model in IN_CSV),
 )  # fmt: skip
-
-
-COMPARISON_COLUMNS = (
-    "model", "fitted", "heading", "horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m",
-    "expected_pct", "p95_pct",
-)  # fmt: skip
-
-
-def comparison_rows(report: DropoutDocument) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of ladder.csv, a model and horizon each; see `COMPARISON_COLUMNS`."""
-    rows = {one.name: one.by_horizon for one in report.models}
-    for score in report.ladder.models or ():
-        for row in rows[score.name]:
-            numbers = (getattr(row, name) for name in COMPARISON_COLUMNS[3:])
-            yield score.name, score.fitted, score.heading, *numbers
 
 
 ROWS_A_GROUP = 1 << 18

@@ -78,7 +78,7 @@ def test_a_log_is_fitted_and_reported_on_in_one_go(fitted: Path) -> None:
     assert "Traceback" not in err
     assert (fitted / RUN / "states.csv").is_file()
     assert (fitted / RUN / "plots" / "trajectory.png").is_file()
-    files = {"summary.csv", "histogram.csv", "ladder.csv", "worst.csv", "report.json", "trials.parquet"}
+    files = {"summary.csv", "histogram.csv", "worst.csv", "report.json", "trials.parquet"}
     pictures = {f"plots/{name}.png" for name in PICTURES | {"outages"}}
     assert files_in(fitted / RUN / "dropout") == files | pictures
     assert "within 0.5 m (95 %)" in out
@@ -115,7 +115,6 @@ def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(fold
     assert files_in(folder / RUN / "dropout") == {
         "summary.csv",
         "histogram.csv",
-        "ladder.csv",
         "worst.csv",
         "report.json",
     }
@@ -236,7 +235,7 @@ def test_the_ladder_holds_the_rows_of_the_summary(fitted: Path) -> None:
 
 
 def test_a_finished_run_has_the_ladder_of_its_log(folder: Path, report_here) -> None:
-    file = folder / RUN / "dropout" / "ladder.csv"
+    file = folder / RUN / "dropout" / "summary.csv"
     of_log = pd.read_csv(file)
     status, _, err = report_here(folder, RUN)
     assert (status, err) == (0, "")

@@ -9,6 +9,7 @@ import numpy as np
 
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats
+from icrtool.output.series import round_steps
 from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.run import ICR_COLUMNS, Run
 
@@ -83,8 +84,7 @@ def _svg_path(x: Floats, y: Floats) -> str:
 
 def _round_length(most_m: float) -> float:
     """Return the largest of 1, 2, 5, 10, 20 … [m] that is not above a length."""
-    unit = 10.0 ** math.floor(math.log10(most_m))
-    return unit * max(digit for digit in (1.0, 2.0, 5.0) if digit * unit <= most_m * (1.0 + 1e-9))
+    return float(max(step for step in round_steps(most_m) if step <= most_m))
 
 
 class Geometry(NamedTuple):

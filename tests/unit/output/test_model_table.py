@@ -1,4 +1,4 @@
-"""The rows of ladder.csv and of report.json: those of summary.csv."""
+"""The rows of the model comparison in report.json: those of summary.csv."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.output.dropout_directory import COMPARISON_COLUMNS, comparison_rows
 from icrtool.output.files.formats import json_bytes
 from icrtool.records.rows import REPORT_ROWS
 
@@ -18,14 +17,12 @@ def report(make_run) -> DropoutReport:
     return icrtool.dropout_report(make_run(duration_s=90.0))
 
 
-def test_rows_are_those_of_the_summary(report: DropoutReport) -> None:
-    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in comparison_rows(report.document)]
-    summary = report.summary
-    assert [row["model"] for row in rows] == list(summary["model"])
-    for name in ("horizon_m", "trials", "p95_m", "expected_error_m", "expected_pct"):
-        assert [row[name] for row in rows] == pytest.approx(list(summary[name]), nan_ok=True)
-    assert {row["heading"] for row in rows} == {"wheels", "heading"}
-    learned = {row["model"]: row["fitted"] for row in rows}
+def test_each_row_states_what_it_learned_from_and_what_turns_it(report: DropoutReport) -> None:
+    models = report.document.ladder.models
+    assert models is not None
+    assert [one.name for one in models] == list(dict.fromkeys(report.summary["model"]))
+    assert {one.heading for one in models} == {"wheels", "heading"}
+    learned = {one.name: one.fitted for one in models}
     assert learned["icr"] == REPORT_ROWS["icr"].knows
     assert learned["no_slip"] == "the track width"
     assert learned["recommended"] == learned["controller"] == "the rest of the drive"

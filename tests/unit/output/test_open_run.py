@@ -188,7 +188,6 @@ def test_the_library_gives_what_the_command_gives(stored: Run, tmp_path: Path) -
         "summary.csv",
         "histogram.csv",
         "worst.csv",
-        "ladder.csv",
         "report.json",
         "plots",
     }
