@@ -22,6 +22,9 @@ INSTALL   := $(if $(UV),$(UV) pip install --quiet --no-config --python $(BIN)/py
 # Python then keeps its compiled modules: the commands that the tests run would each compile numpy and numba again.
 export PYTHONDONTWRITEBYTECODE =
 
+# A dot every three seconds while the command behind it is silent.
+DOTS := (while sleep 3; do printf . >&2; done) & trap "kill $$!; echo >&2" EXIT;
+
 # Compiles what the commands load, and nothing else of a gigabyte: where Python may not write, each would compile it.
 LOAD = import pkgutil, icrtool; [__import__(one.name) for one in pkgutil.walk_packages(icrtool.__path__, 'icrtool.')]
 
@@ -41,21 +44,22 @@ setup: $(READY)  ## make .venv with the pinned packages that icrtool runs on, an
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "$(PYTHON) is Python " + sys.version.split()[0] + "; icrtool needs 3.11 or newer: make PYTHON=python3.11 ...")'
-	@echo "Setting up $(VENV): 40 packages, about 150 MB to fetch; half a minute to two minutes the first time."
+	@echo "Setting up $(VENV): 43 packages, about 150 MB to fetch; half a minute to two minutes the first time."
 	@$(MAKE_VENV)
-	@$(INSTALL) --no-deps --require-hashes -r constraints.txt
+	@$(DOTS) $(INSTALL) --no-deps --require-hashes -r constraints.txt
 	@$(INSTALL) --no-deps --no-build-isolation -e .
 	@touch $@
 
 setup-dev: $(DEV)  ## add the pinned packages for tests, docs and benchmarks
 
 $(DEV): $(READY) constraints-dev.txt
-	@echo "Adding to $(VENV) what tests, docs and benchmarks need: 170 packages; one to three minutes the first time."
-	@$(INSTALL) --no-deps --require-hashes -r constraints-dev.txt
+	@echo "Adding to $(VENV) what tests, docs and benchmarks need: 163 packages; one to three minutes the first time."
+	@$(DOTS) $(INSTALL) --no-deps --require-hashes -r constraints-dev.txt
 	@$(BIN)/python -c "$(LOAD)"
 	@touch $@
 
 demo: $(READY)  ## learn the ICRs of the sample robot, report its GPS dropouts, say where the plots are
+	@echo "Fitting $(DEMO_LOG); the first fit on a computer compiles for about 8 s"
 	$(BIN)/icrtool fit $(DEMO_LOG) $(DEMO_OPTIONS)
 	@echo
 	$(BIN)/icrtool dropout-report $(DEMO_RUN)

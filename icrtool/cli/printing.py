@@ -261,7 +261,7 @@ class Stages(LiveLine):
 
     def _compiling(self) -> None:
         """Show why the first command on a computer waits."""
-        self.rewrite(f"{self._title} (compiling, once on this computer) …")
+        self.rewrite(f"{self._title} (compiling, once on this computer: about 8 s) …")
 
     def begin(self, stage: str) -> None:
         """Begin a stage: what is being done, for example ``reading``."""

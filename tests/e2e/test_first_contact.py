@@ -101,7 +101,7 @@ def test_the_first_run_says_that_it_compiles(
     with Stages("log") as stages:
         stages.begin("filter")
         assert kernel(1.0) == 2.0
-        assert "log: filter (compiling, once on this computer) …" in capsys.readouterr().err
+        assert "log: filter (compiling, once on this computer: about 8 s) …" in capsys.readouterr().err
         assert kernel(2.0) == 3.0
         assert "compiling" not in capsys.readouterr().err
     assert Kernel(heading_of)(1.0) == 2.0
