@@ -159,7 +159,7 @@ def drive_charts(position_word: str) -> tuple[Chart, ...]:
         Chart(
             "icrs",
             icrs.title,
-            f"{icrs.caption} Bands: ±2σ. The dotted lines are half the track width: no slip.",
+            f"{icrs.caption} Bands: ±σ. The dotted lines are half the track width: no slip.",
         ),
         Chart(
             "differences",

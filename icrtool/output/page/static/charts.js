@@ -17,7 +17,7 @@ const icrtoolCharts = (() => {
   }
 
   function clock(seconds) {
-    const whole = Math.floor(seconds), h = Math.floor(whole / 3600), m = Math.floor(whole / 60) % 60, s = whole % 60;
+    const whole = Math.round(seconds), h = Math.floor(whole / 3600), m = Math.floor(whole / 60) % 60, s = whole % 60;
     const two = (number) => String(number).padStart(2, "0");
     return h ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
   }
@@ -197,7 +197,7 @@ const icrtoolCharts = (() => {
     for (const one of entries) {
       const first = columns.length;
       const edge = { label: one.label, stroke: "transparent", width: 0, points: { show: false } };
-      columns.push(one.value.map((value, i) => value + 2 * one.std[i]), one.value, one.value.map((value, i) => value - 2 * one.std[i]));
+      columns.push(one.value.map((value, i) => value + one.std[i]), one.value, one.value.map((value, i) => value - one.std[i]));
       series.push(edge, line(one), { ...edge });
       bands.push({ series: [first, first + 2], fill: faint(one.color, 0.22) });
     }
