@@ -19,7 +19,7 @@ WIDTH, HEIGHT, MARGIN = 360.0, 240.0, 16.0
 LONGEST_BAR = 0.3
 """Largest length of the scale bar, as a share of the width."""
 
-NEAR = 0.7
+NEAR = 1.5
 """Distance of two points below which the second one is not drawn [units of the drawing]."""
 
 
