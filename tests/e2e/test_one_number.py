@@ -17,11 +17,9 @@ ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = {"wheeled_lawnmower.mcap": "segway-rmp400", "tracked_curved.bag": "pentzer-tracked"}
 SHARED = {
     "real/warthog_grass_0729": "warthog",
-    "real/warthog_grass.bag": "warthog",
     "real/husky_wet_grass": "husky-a200",
     "real/husky_parking_lot.bag": "husky-a200",
     "simulated/tracked_trouble": "jackal",
-    "simulated/wheeled_circle": "segway-rmp400",
     "simulated/wheeled_stuck": "segway-rmp400",
 }
 
@@ -39,7 +37,7 @@ class Content(HTMLParser):
         super().__init__()
         self.words: list[str] = []
         self.rows: list[list[str]] = []
-        self._inside = ""
+        self._inside, self._in_cell = "", False
         self.feed(page)
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
@@ -48,16 +46,18 @@ class Content(HTMLParser):
             self.rows.append([])
         if tag in {"td", "th"} and self.rows:
             self.rows[-1].append("")
-        if tag in {"br", "small"} and self.rows and self.rows[-1]:
+            self._in_cell = True
+        if tag in {"br", "small"} and self._in_cell:
             self.rows[-1][-1] += " "
 
     def handle_endtag(self, tag: str) -> None:
         self._inside = "" if tag in {"script", "style"} else self._inside
+        self._in_cell = self._in_cell and tag not in {"td", "th"}
 
     def handle_data(self, data: str) -> None:
         if not self._inside:
             self.words.append(data)
-            if self.rows and self.rows[-1]:
+            if self._in_cell:
                 self.rows[-1][-1] += data
 
 
@@ -113,7 +113,8 @@ def check_distances(lines: list[str], report: Json, page: Content) -> int:
         assert not report["usable"]
         return 12
     checked = 0
-    rows = {row[0]: [plain(cell) for cell in row] for row in page.rows if row and len(row) >= 3}
+    # The first row of a name: of the first table of the page.
+    rows = {row[0]: [plain(cell) for cell in row] for row in reversed(page.rows) if len(row) > 2}
     for line in lines[begin + 1 :]:
         if not line.startswith("   "):
             break
