@@ -48,8 +48,8 @@ def forecast_figure(
     # Of both errors of each forecast, budgets, and up to three more.
     entries = 2 * (1 if gyro is None else 2) + len(budgets_m) + 3
     keys_in = style.KEY_ROW_IN * max(-(-entries // FORECAST_KEY_COLUMNS) - 2, 0)
-    height_in, margins_in = 4.2 + keys_in, (0.7, 0.25, 0.75, 0.95 + keys_in)
-    layout = {"width_in": 9.0, "height_in": height_in, "wspace": 0.28}
+    height_in, margins_in = 4.3 + keys_in, (0.8, 0.25, 0.75, 1.05 + keys_in)
+    layout = {"width_in": 8.2, "height_in": height_in, "wspace": 0.28}
     sheet = new_sheet(answer, subtitle, ax, margins_in=margins_in, **layout)
     grown, path = sheet.subplots(1, 2)[0]
     for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
@@ -122,7 +122,7 @@ MOST_DIFFERENCES = 24
 """Largest number of differences that are drawn at all distances. Of more, those after `CHOICE_HORIZON_M` are drawn."""
 
 FOREST_ROW_IN, FOREST_GAP_IN = 0.25, 1.0
-"""Height of a row of a forest plot, and of the space between two [in]."""
+"""Height of a row of a forest plot, and of the space between two plots [in]."""
 
 SURE_LOOK: style.Look = {"marker": "o", "markersize": 5.0, "color": style.ICR["color"], "linestyle": "none",
                          "elinewidth": 1.8, "capsize": 2.5}  # fmt: skip
@@ -149,12 +149,9 @@ def transfer(found: GroupComparison, *, ax: Axes | None = None) -> Figure | Axes
     errors, rows = _errors_of_groups(found), _differences(found)
     names = " · ".join(found.groups)
     heights = [max(len(part), 2) for part in (errors, rows)]
-    height_in = 2.6 + FOREST_ROW_IN * sum(heights)
-    layout: style.Look = {
-        "height_in": height_in,
-        "margins_in": (2.5, 0.25, 0.85, 1.0),
-        "hspace": 1.05 / height_in * 2.0,
-    }
+    panels_in = FOREST_ROW_IN * sum(heights)
+    height_in, hspace = panels_in + FOREST_GAP_IN + 1.85, FOREST_GAP_IN / (panels_in / 2)
+    layout: style.Look = {"height_in": height_in, "margins_in": (2.5, 0.25, 0.85, 1.0), "hspace": hspace}
     sheet = new_sheet(
         _comparison_title(found), f"{names}: 95 % errors by wheels alone, with 95 % intervals", ax, **layout
     )
