@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_figure_eight"
 RUN = Path("icrtool-runs") / LOG.name
 ROBOT = ("--robot", "segway-rmp400")
-PICTURES = {"summary", "histogram", "worst"}
+PICTURES = {"summary", "histogram", "worst", "error_map"}
 NO_PLOTS = ("--plots", "none")
 EASY, HARD = "icr.p95@10m <= 100", "icr.p95@10m <= 0.001"
 

@@ -191,7 +191,7 @@ def test_the_library_gives_what_the_command_gives(stored: Run, tmp_path: Path) -
         "report.json",
         "plots",
     }
-    assert {"summary.png", "histogram.png", "worst.png", "outages.png"} == {
+    assert {"summary.png", "histogram.png", "worst.png", "outages.png", "error_map.png"} == {
         path.name for path in (tmp_path / "report" / "plots").iterdir()
     }
     report.write(plots=())
