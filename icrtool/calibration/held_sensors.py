@@ -31,6 +31,9 @@ BETWEEN_DRIVES_STD = LogConstants(math.radians(0.5), 0.02, GYRO_START_STD[1], 0.
 An installation does not change. What remains is how ground and speed change the robot's response to its wheels, and the
 temperature of a gyro."""
 
+SENSORS_CONTRADICT = "sensors_contradict_calibration"
+"""Code of a note about a constant that a log contradicts."""
+
 SENSOR_SIGMAS = 3.0
 """Difference between a held constant and a log's own, in standard deviations, from which on the log contradicts it."""
 
@@ -185,5 +188,5 @@ def contradictions(row: str, sensors: documents.HeldSensors, among: Iterable[str
             why = f"{words}: the calibration {both}, {abs(apart) / std:.1f} σ apart"
             what = "its errors hold this difference; --refit-sensors takes the constants of this log"
             advice = "calibrate again if a sensor was moved or a clock has changed"
-            notes.append(note("sensors_contradict_calibration", f"row {row}: {why}: {what}; {advice}"))
+            notes.append(note(SENSORS_CONTRADICT, f"row {row}: {why}: {what}; {advice}"))
     return notes

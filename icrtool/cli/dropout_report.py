@@ -94,6 +94,8 @@ def dropout_report_command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
+    if report.refit_sensors and not calibration_files:
+        raise click.UsageError("--refit-sensors refits the sensors of a calibration: name one with --calibration")
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)
     report = report.configured(config)

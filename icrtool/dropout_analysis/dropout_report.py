@@ -481,6 +481,7 @@ def _calibration_rows(
         kept = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
         seen = one.fitted_to(recording.sha256)
         fitted = "fitted to this log" if seen else "not fitted to this log"
+        refitted = "; sensors refitted" if request.refit_sensors else ""
         rows = [(name, one.recommended, False)]
         if one.gyro is not None and recording.track.gyro is not None:
             rows.append((f"{name}_gyro", one.gyro.model, True))
@@ -490,7 +491,6 @@ def _calibration_rows(
             )
             models.append(ComparedRow(row, tested.drive.errors, knows=f"other logs ({fitted}); {tested.knows}"))
             notes += tested.notes
-            used.append(
-                UsedCalibration(row, model, len(one.logs), seen, created, with_gyro, kept, fitted, tested.sensors)
-            )
+            words = f"{fitted}{refitted}", tested.sensors
+            used.append(UsedCalibration(row, model, len(one.logs), seen, created, with_gyro, kept, *words))
     return tuple(used), models, notes

@@ -185,6 +185,7 @@ def test_no_run_at_all_is_said_in_one_line(tmp_path: Path) -> None:
         (("--horizons", "1,x"), 2, "--horizons"),
         (("--horizons", "0"), 2, "--horizons"),
         (("--outage-at", "5"), 2, "--outage"),
+        (("--refit-sensors",), 2, "--calibration"),
         (("--outage", "1e6"), 1, "too long"),
         (("--budget", "-1"), 2, "--budget"),
         (("--budget", "nan"), 1, "budget"),

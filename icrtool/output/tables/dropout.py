@@ -9,6 +9,7 @@ from contextlib import suppress
 from msgspec import UNSET
 from msgspec.structs import replace
 
+from icrtool.calibration.held_sensors import SENSORS_CONTRADICT
 from icrtool.calibration.record import Calibration, fitted_model, stored_calibration
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
@@ -173,7 +174,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
         blocks.append(Section("Other models", [Table("lrrl", others, head)], VERBOSE))
     if blocks:
         meaning = NEXT_DRIVE_MEANS if others_known else f"{NEXT_DRIVE_MEANS}; another ground is not shown"
-        blocks += [*heading_lines(report), *as_good_lines(report), *others_known, meaning]
+        blocks += [*heading_lines(report), *as_good_lines(report), *others_known, meaning, *sensor_lines(report)]
     else:
         blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
@@ -205,6 +206,11 @@ def heading_lines(report: DropoutDocument) -> Iterator[str]:
         whole = f"{error_text(found.p95_m)} after {report.best.horizon_m:g} m (95 %)"
         left = f"{error_text(found.aligned_p95_m)} remain with aligned headings"
         yield f"the heading at the start makes most of the error: {whole}, of which {left}; {found.mend}"
+
+
+def sensor_lines(report: DropoutDocument) -> Iterator[str]:
+    """Yield which sensors' constants of a calibration the log contradicts."""
+    return (one.sentence for one in report.notes if one.code == SENSORS_CONTRADICT)
 
 
 def as_good_lines(report: DropoutDocument) -> Iterator[str]:

@@ -23,6 +23,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.config import parse_config
 from icrtool.motion.recording import LogConstants, cut_trials
 from icrtool.motion.window_fit import CONSTANT_STD, KnownConstants
+from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.calibration_document import CalibrationLog, LogSensors
 from icrtool.records.run import Run
 from icrtool.records.samples import GyroSamples
@@ -110,6 +111,10 @@ def test_a_sensor_that_was_moved_is_noted_and_refitted_on_request(calibration: C
     assert "--refit-sensors" in found.text
     assert found.text.count("±") == 2
     assert not [one for one in refit.document.notes if one.code == code]
+    texts = [" ".join(format_dropout(one).split()) for one in (held, refit)]
+    assert "heading offset: the calibration holds" in texts[0]
+    assert "the calibration holds" not in texts[1]
+    assert "not fitted to this log; sensors refitted" in texts[1]
     errors = [one.result("calibration").column("expected_error_m")[9] for one in (held, refit)]
     # 3 degrees over 10 m are 0.52 m
     assert errors[0] > 0.4
