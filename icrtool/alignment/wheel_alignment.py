@@ -8,6 +8,7 @@ corrects it by an absolute heading, the difference stays bounded for any duratio
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -179,7 +180,7 @@ def align_wheels(
     change = None if fit is None or not sound else find_changes(fit)
     filtered = "" if fit is None or not sound or change is not None else find_filtering(fit)
     if fit is not None and not filtered:
-        applied, notes = _find_scales(fit, config, sound=sound)
+        applied, notes = _find_scales(fit, config, _radius_hint(log, config, fit.estimate("scale")[0]), sound=sound)
     moving = (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))[1:] > 0
     same = (np.diff(wheels.v_left_mps) == 0) & (np.diff(wheels.v_right_mps) == 0)
     share = float(same[moving].mean()) if np.count_nonzero(moving) >= FEWEST_ALIGNMENT_WINDOWS else 0.0
@@ -229,8 +230,27 @@ def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
     return float(left.sum() / turned.sum()), std
 
 
-def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[Note]]:
+def _radius_hint(log: RobotLog, config: Config, scale: float) -> str:
+    """Return what a wrong distance of wheels states of their radius; empty where they need none."""
+    radius_m = config.robot.wheel_radius_m
+    by_radius = any(one.role == "wheels" and _ANGLES.search(one.why) for one in log.streams)
+    if radius_m is None or not by_radius:
+        return ""
+    robot = f"{config.robot.name} has {radius_m:g} m" if config.robot.name else f"{radius_m:g} m is configured"
+    question = "is --robot right? check" if config.robot.name else "check"
+    return f"the log shows a wheel radius of {scale * radius_m:.3f} m, {robot}: {question} "
+
+
+_ANGLES = re.compile(r" in (rad|counts)")
+"""Words of a stream whose speeds are those of wheels of the configured radius."""
+
+
+def _find_scales(
+    fit: AlignmentFit, config: Config, radius: str, *, sound: bool
+) -> tuple[tuple[float, float], list[Note]]:
     """Return the factors to apply to the speeds of the left and of the right side, and findings.
+
+    `radius`: what the scale states of the wheel radius, empty where it states nothing.
 
     Notes
     -----
@@ -256,7 +276,8 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
             done = "corrected; wheels.left_scale and right_scale set it"
             notes.append(note("wheel_scale_corrected", f"{text}: {done}"))
         else:
-            notes.append(note("wheel_scale_differs", f"{text}: check wheel radius, encoder resolution and units"))
+            check = f"{radius or 'check '}wheel radius, encoder resolution and units"
+            notes.append(note("wheel_scale_differs", f"{text}: {check}"))
     (asymmetry, asymmetry_std), (turn, turn_std) = fit.estimate("asymmetry"), fit.estimate("turn")
     if turn <= 0.0:
         return (factor, factor), notes

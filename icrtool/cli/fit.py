@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from icrtool.records.requests import FitRequest, ResultFiles
     from icrtool.records.run import Run
 
+MOST_WARNINGS = 2
+"""Number of warnings that `icrtool fit` prints below its results; -v prints all."""
+
 REQUEST = options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", options.together(
     "files",
     f"{options.REQUESTS_MODULE}:ResultFiles",
@@ -77,7 +80,8 @@ def fit_command(
     inputs, all_usable = Inputs("log"), True
     for log, (directory, inside) in zip(logs, run_directories(logs, place), strict=True):
         with inputs.each(log) as document:
-            with fitted_log(log, RunPlace(directory, inside), config, request, files, printer, warm_start) as (run, _):
+            place_of_run = RunPlace(directory, inside)
+            with fitted_log(log, place_of_run, config, request, files, printer, warm_start, warns=False) as (run, _):
                 pass
             all_usable = all_usable and run.usable
             if strict and not (run.usable or printer.shows):
@@ -87,6 +91,7 @@ def fit_command(
             # The command that names what is wrong in the log.
             examine = shlex.join(["icrtool", "info", escaped(str(log)), "-v", *options.given(settings, request)])
             printer.show([*run_tables.run_blocks(run.document), *run_tables.next_blocks(run.document, where, examine)])
+            printer.warn_of(run, most=MOST_WARNINGS)
     printer.json("fit", {"logs": inputs.documents})
     inputs.leave("logs", gate_failed=strict and not all_usable)
 
@@ -94,9 +99,9 @@ def fit_command(
 @contextmanager
 def fitted_log(
     log: Path, place: RunPlace, config: Config, request: FitRequest, files: ResultFiles, printer: Printer,
-    warm_start: Path | None = None,
+    warm_start: Path | None = None, *, warns: bool = True,
 ) -> Iterator[tuple[Run, Path]]:  # fmt: skip
-    """Fit a log, and give as `icrtool.pipeline.fit_into` does; print warnings and chosen streams on stderr.
+    """Fit a log, and give as `icrtool.pipeline.fit_into` does; with `warns`, print its warnings and streams on stderr.
 
     A run of other settings is not replaced, unless that is asked for.
     """
@@ -120,7 +125,9 @@ def fitted_log(
         ) as found,  # fmt: skip
     ):
         yield found
-    printer.warn_of(found[0], *reported)
+    if warns:
+        printer.warn_of(found[0])
+    printer.warn(reported)
     for line in text_format.jump_lines(found[0].document.reference_jumps):
         printer.detail(line)
 

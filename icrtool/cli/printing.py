@@ -18,14 +18,14 @@ import click
 from icrtool import __version__
 from icrtool.cli import when_used
 from icrtool.output.text_blocks import Block, Line, Table, fitted_to, format_blocks, printed
-from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
+from icrtool.records.text import LONGEST_NAME, counted, escaped, listed, shortened
 
 with when_used():
     from icrtool import errors
     from icrtool.kernels import compiled
     from icrtool.output import text_format
     from icrtool.output.files import atomic, formats
-    from icrtool.records import plain_data, samples
+    from icrtool.records import notes, plain_data, samples
 
 if TYPE_CHECKING:
     import msgspec
@@ -154,11 +154,19 @@ class Printer(NamedTuple):
             for warning in warnings:
                 click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
 
-    def warn_of(self, run: Run, *further: str) -> None:
-        """Print the warnings of a run and further ones, with -v also why each stream was chosen."""
+    def warn_of(self, run: Run, *, most: int | None = None) -> None:
+        """Print the warnings of a run, with -v also why each stream was chosen.
+
+        `most`: only so many of them, the gravest first, and how many more there are; -v prints all.
+        """
         # On a terminal the answer names the gravest one.
-        everything = self.verbose or not sys.stderr.isatty()
-        self.warn((*(run.warnings if everything else ()), *further))
+        if self.verbose or most is None:
+            self.warn(run.warnings if self.verbose or not sys.stderr.isatty() else ())
+        elif not sys.stderr.isatty():
+            gravest = notes.gravest(run.notes)
+            self.warn(one.sentence for one in gravest[:most])
+            if len(gravest) > most and not self.quiet:
+                click.echo(f"{counted(len(gravest) - most, 'more warning')}: -v, or run.json", err=True)
         if self.verbose:
             for stream in run.document.streams:
                 topics = text_format.topics_text(stream.topic)

@@ -261,7 +261,15 @@ def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
     if section.label:
         label, text = f"{section.label:{LABEL + 2}}", f"{section.lead} {section.text}".strip()
         yield _sentence(label, text, 3, GRADE_LOOKS[section.grade], verbose=verbose)
-    yield from printed(section.blocks, verbose=verbose)
+    # a table whose caption is the title that was just printed
+    titled = section.title if verbose else ""
+    yield from printed(
+        (
+            one._replace(caption="") if isinstance(one, Table) and titled and one.caption == titled else one
+            for one in section.blocks
+        ),
+        verbose=verbose,
+    )
 
 
 def _labelled(block: Facts | Checks, verbose: bool) -> Iterator[tuple[str, str, int]]:

@@ -75,5 +75,10 @@ def unusable_because(notes: Iterable[Note]) -> str | None:
 
 def first_to_read(notes: Sequence[Note]) -> Note | None:
     """Return the first finding of the highest grade below grave, None without one."""
+    return next(iter(gravest(notes)), None)
+
+
+def gravest(notes: Iterable[Note]) -> list[Note]:
+    """Return the findings below grave, by their grade, the highest first; of one grade, as they were made."""
     shown = [one for one in notes if not is_grave(one)]
-    return max(shown, key=lambda one: GRADES.index(one.grade), default=None)
+    return sorted(shown, key=lambda one: -GRADES.index(one.grade))

@@ -112,7 +112,9 @@ def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
         times = [word for one in stretches[1:] for word in ("--terrain-change", f"{one.begin_s:.0f}")]
         command = shlex.join(["icrtool", "fit", summary.inputs[0].path, *times])
     drive = advice(summary)
-    return [Section("", [Facts([("written to", place), ("next", drive)]), next_line("" if drive else command)])]
+    distance = "without GNSS: not known yet, icrtool dropout-report tests it" if summary.usable else ""
+    facts = Facts([("distance", distance), ("written to", place), ("next", drive)])
+    return [Section("", [facts, next_line("" if drive else command)])]
 
 
 def next_line(command: str) -> Line:
