@@ -157,11 +157,11 @@ class Printer(NamedTuple):
     def warn_of(self, run: Run, *, most: int | None = None) -> None:
         """Print the warnings of a run, with -v also why each stream was chosen.
 
-        `most`: only so many of them, the gravest first, and how many more there are; -v prints all.
+        `most`: only so many of them, the gravest first, and how many more there are; -v and --json print all.
         """
         # On a terminal the answer names the gravest one.
-        if self.verbose or most is None:
-            self.warn(run.warnings if self.verbose or not sys.stderr.isatty() else ())
+        if self.verbose or self.as_json or most is None:
+            self.warn(run.warnings if self.verbose or self.as_json or not sys.stderr.isatty() else ())
         elif not sys.stderr.isatty():
             gravest = notes.gravest(run.notes)
             self.warn(one.sentence for one in gravest[:most])
