@@ -15,7 +15,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut, counted_ns
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED_SUFFIX, log_name
+from icrtool.logs.csv_table import csv_frame
 from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.logs.messages.definitions import definition_note
 from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, collector_for
@@ -39,18 +39,12 @@ from icrtool.records.samples import InputFile, Role, rate_and_jitter
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText, escaped
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 Progress = Callable[[float], None]
 
 Moment = float | str | datetime
 """Seconds since the log's first message, or a time of day: a `datetime`, or a text in ISO 8601."""
 
 _CSV_NAME = re.compile(rf"\.csv(?:{PACKED_SUFFIX})?$", re.IGNORECASE)
-
-LONGEST_HEAD_BYTES = 1 << 18
-"""Largest size of the line that names the columns [bytes]: pandas takes a minute for a million columns."""
 
 
 def survey_log(
@@ -275,43 +269,6 @@ def nanoseconds(given: float | datetime, first_ns: int) -> int:
 def is_table(path: Path) -> bool:
     """Return whether a path, or an address, names a table."""
     return _CSV_NAME.search(path.name) is not None and (path.is_file() or isinstance(path, UrlPath))
-
-
-def table_form(head: bytes, row: bytes) -> tuple[str, str]:
-    """Return the character between the columns of a table, and its decimal sign, by its first line and first row.
-
-    Where semicolons or tabs part the columns, as in countries with a decimal comma, a comma in the row is a decimal
-    sign.
-    """
-    counts = {sign: head.count(sign.encode()) for sign in (",", ";", "\t")}
-    separator = max(counts, key=lambda sign: counts[sign])
-    return separator, "," if separator != "," and b"," in row else "."
-
-
-def csv_frame(path: Path) -> pd.DataFrame:
-    """Return the columns of a CSV file whose first line names them.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    ValueError
-        It is not a table: text that is not UTF-8, a line that names too many columns, or rows with more values.
-    """
-    import pandas as pd
-
-    with path.open("rb") as stream:
-        if len(head := stream.readline(LONGEST_HEAD_BYTES)) == LONGEST_HEAD_BYTES:
-            raise ValueError(f"its first line has more than {head.count(b',')} columns")
-        first = stream.readline(LONGEST_HEAD_BYTES)
-    separator, decimal = table_form(head, first)
-    table = pd.read_csv(path, skipinitialspace=separator != "\t", sep=separator, decimal=decimal, encoding="utf-8-sig")
-    signs = {";": "semicolons", "\t": "tabs"}
-    if separator != ",":
-        table.attrs["form"] = f"{signs[separator]} between columns" + (", decimal comma" if decimal == "," else "")
-    if not isinstance(table.index, pd.RangeIndex):
-        raise ValueError("its rows have more values than its first line has names")  # noqa: TRY004 - of the file
-    return table
 
 
 def read_table(path: Path, start: Moment | None = None, end: Moment | None = None) -> RobotLog:

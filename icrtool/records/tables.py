@@ -52,6 +52,17 @@ POSITION = (("north_m", "east_m"), ("latitude_deg", "longitude_deg"))
 POSITION_STD = (("north_std_m", "east_std_m"), ("position_std_m", "position_std_m"))
 HEADING_COLUMNS = (("heading_rad",), ("heading_deg",), ("yaw_rad",), ("yaw_deg",))
 GYRO_COLUMNS = (("turn_rate_radps",), ("yaw_rate_radps",))
+HEADING_STD = (("heading_std_rad", 1.0), ("heading_std_deg", math.pi / 180))
+"""Columns of the standard deviation of headings, and their units [rad]."""
+
+CLOCK_COLUMNS, HEIGHT = (("stamp_ns",), ("t_s",)), "height_m"
+
+TABLE_COLUMNS = {
+    HEIGHT, *(name for name, _ in HEADING_STD),
+    *(name for group in (*WHEEL_COLUMN_UNITS, *POSITION, *POSITION_STD, *HEADING_COLUMNS, *GYRO_COLUMNS, *CLOCK_COLUMNS)
+      for name in group),
+}  # fmt: skip
+"""Columns of data frames that a log can use."""
 
 LATEST_S = 4e9
 """Limit of stamps, the year 2096: differences of larger stamps may overflow 64 bits of nanoseconds."""
@@ -195,15 +206,17 @@ def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str,
         if all(column in frame for column in columns):
             return columns
     half = [column for columns in options for column in columns if column in frame]
-    found = f"only {half[0]} of a pair" if half else f"the columns are {', '.join(map(str, list(frame)[:12]))}"
+    names = list(frame.attrs.get("names", frame))[:12]
+    found = f"only {half[0]} of a pair" if half else f"the columns are {', '.join(map(str, names))}"
     wanted = " or ".join(" and ".join(dict.fromkeys(columns)) for columns in options)
     raise DataError(name, f"{group}: no column {wanted}", found)
 
 
 def _numbers(frame: pd.DataFrame, column: str, name: str) -> Floats:
-    """Return a column (n,), NaN where it is empty."""
+    """Return a column (n,), NaN where it is empty; as in messages, a number above `LARGEST_STATE` is infinite."""
     try:
-        return np.asarray(frame[column], np.float64)
+        values = np.asarray(frame[column], np.float64)
+        return np.where(np.abs(values) > LARGEST_STATE, np.copysign(np.inf, values), values)
     except (TypeError, ValueError, OverflowError) as err:
         raise DataError(name, f"column {column}: holds a value that is not a number", str(err)) from err
 
@@ -227,7 +240,7 @@ def _rows(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) ->
 
 def _stamped(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) -> tuple[str, Floats, Bools]:
     """Return the column of stamps, its values [s] (rows,), and which rows have numbers in it and in `columns`."""
-    (clock,) = _chosen(frame, (("stamp_ns",), ("t_s",)), group, name)
+    (clock,) = _chosen(frame, CLOCK_COLUMNS, group, name)
     seconds = _numbers(frame, clock, name) * (1.0 if clock == "t_s" else 1e-9)
     values = [seconds, *(_numbers(frame, column, name) for column in columns)]
     return clock, seconds, np.logical_and.reduce(np.isfinite(values))
@@ -248,7 +261,7 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
     columns = _chosen(frame, POSITION, "position", name)
     stated = any(column in frame for pair in POSITION_STD for column in pair)
     stds = _chosen(frame, POSITION_STD, "position", name) if stated else ()
-    further = [column for column in dict.fromkeys((*stds, "height_m")) if column in frame]
+    further = [column for column in dict.fromkeys((*stds, HEIGHT)) if column in frame]
     stamps, (first, second) = _rows(frame, columns, "position", name)
     extra = {column: _at(frame, column, columns, stamps, name) for column in further}
     unknown, datum, north, east = np.full(len(stamps), np.nan), None, first, second
@@ -257,7 +270,7 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
 
         if np.any(np.abs(first) > 90) or np.any(np.abs(second) > 360):
             raise DataError(name, "column latitude_deg or longitude_deg: not degrees", "are they in radians, or E7?")
-        height = np.nan_to_num(extra.get("height_m", unknown))
+        height = np.nan_to_num(extra.get(HEIGHT, unknown))
         datum = Datum(float(first[0]), float(second[0]), float(height[0]))
         north, east, _ = geodetic2ned(first, second, height, datum.latitude_deg, datum.longitude_deg, datum.height_m)
     # The square of a standard deviation that is no real one may overflow.
@@ -283,7 +296,7 @@ def _heading(frame: pd.DataFrame, name: str) -> tuple[HeadingSamples, tuple[str,
     angle = np.radians(angle) if columns[0].endswith("_deg") else angle
     heading = math.pi / 2 - angle if columns[0].startswith("yaw") else angle
     std = np.full(len(stamps), np.nan)
-    for column, unit in (("heading_std_rad", 1.0), ("heading_std_deg", math.pi / 180)):
+    for column, unit in HEADING_STD:
         if column in frame:
             std = unit * _at(frame, column, columns, stamps, name)
             std[np.abs(std) >= LARGEST_STD] = np.nan

@@ -17,13 +17,15 @@ from mcap.writer import CompressionType, Writer
 
 from icrtool.config import Config, load_config
 from icrtool.errors import ConfigError, DefinitionError, IcrToolError, LogError
+from icrtool.logs import csv_table
 from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Packed, decompress
 from icrtool.logs.containers.container import Channel, Cut, MessageBlock, unpack_messages
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
+from icrtool.logs.csv_table import LONGEST_HEAD_BYTES, MOST_COLUMNS
 from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.definitions import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
-from icrtool.logs.read_log import LONGEST_HEAD_BYTES, moment, read_log, survey_log
+from icrtool.logs.read_log import moment, read_log, survey_log
 from icrtool.logs.streams.sources import stamp_rows
 from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
 from icrtool.pipeline import fit
@@ -347,6 +349,54 @@ def test_a_table_that_is_none_is_refused(tmp_path: Path, content: bytes, words: 
     assert time.process_time() - begin < LONGEST_S
 
 
+NAMES = ["stamp_ns", "v_left_mps", "v_right_mps", "latitude_deg", "longitude_deg", "heading_rad"]
+SMALL_TABLES = {
+    "names above rows of nothing": ",".join([*NAMES, *(f"c{i}" for i in range(4000))]) + "\n," * 20_000,
+    "names alike": ",".join(["c"] * 4000) + "\n1" * 20_000,
+    "a first row of more values": ",".join(NAMES) + "\n1" + "," * 60_000,
+    "texts": ",".join([*NAMES, *(f"c{i}" for i in range(1000))]) + ("\n" + "a," * 1000) * 100,
+    "a quote that does not end": ",".join(NAMES) + '\n1,2,"' + "x\n" * 50_000,
+    "empty lines": ",".join(NAMES) + "\n" * 100_000,
+}
+
+
+@pytest.mark.parametrize("kind", SMALL_TABLES)
+def test_a_small_table_takes_little_time_and_memory(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(SMALL_TABLES[kind])
+    size = path.stat().st_size
+    begin = time.process_time()
+    tracemalloc.start()
+    with pytest.raises(IcrToolError):
+        read_log(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 50e6 + 50 * size, "11 kB of a table took 1.26 GB"
+    assert time.process_time() - begin < LONGEST_S + size / 1e6
+
+
+def test_of_a_wide_table_the_columns_that_a_log_can_use_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "log.csv"
+    names = ["operator", *NAMES, *(f"c{i}" for i in range(50))]
+    path.write_text(
+        "\n".join([",".join(names), *(",".join(["x", *[str(row)] * 6, *["0.5"] * 50]) for row in range(99))])
+    )
+    whole = csv_table.csv_frame(path)
+    monkeypatch.setattr(csv_table, "CELLS_AT_ONCE", 10 * len(names))
+    parts = csv_table.csv_frame(path)
+    assert list(parts) == NAMES
+    assert parts.equals(whole)
+    assert list(parts["stamp_ns"]) == list(range(99))
+    path.write_text(path.read_text().replace("v_left_mps", "v_links"))
+    with pytest.raises(IcrToolError, match="only v_right_mps of a pair"):
+        read_log(path)
+    path.write_text(path.read_text().replace("v_right_mps", "v_rechts"))
+    with pytest.raises(IcrToolError, match="the columns are operator, stamp_ns, v_links"):
+        read_log(path)
+
+
 @pytest.mark.parametrize("column", ["t_s", "v_left_mps", "north_m", "position_std_m", "heading_rad", "heading_std_deg"])
 @pytest.mark.parametrize("values", [("1e308", "-1e308"), ("inf", "nan"), ("True", "False")])
 def test_a_column_of_nonsense_is_refused_in_one_line_or_left_out(
@@ -452,7 +502,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
         recording_files.LARGEST_METADATA_BYTES, open_log.MOST_FILES, wheels.MOST_WHEELS,
         wheel_pairs.MOST_LOOKED_AT, wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PATHS, wheel_pairs.MOST_PAIRS,
-        LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, recordings.LARGEST_MANIFEST_BYTES,
+        LONGEST_HEAD_BYTES, MOST_COLUMNS, config.LARGEST_FILE_BYTES, recordings.LARGEST_MANIFEST_BYTES,
     ]  # fmt: skip
 
 

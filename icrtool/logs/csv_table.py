@@ -1,0 +1,124 @@
+"""A CSV file as a data frame: in parts of bounded size, of which the columns that a log can use are kept."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+
+from icrtool.records.tables import TABLE_COLUMNS
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LONGEST_HEAD_BYTES, MOST_COLUMNS = 1 << 18, 4096
+"""Largest size of the line that names the columns [bytes], and largest number of columns: pandas takes a minute for a
+million columns."""
+
+CELLS_AT_ONCE = 1 << 20
+"""Number of cells that are read together: each takes up to 100 bytes."""
+
+MOST_EMPTY, LEAST_CELLS = 4, 1_000_000
+"""Largest number of cells for each byte of a file, and the number that any file may have. pandas makes a cell for each
+column of each row, and rows of two bytes below thousands of names would fill the memory."""
+
+_PIECE_BYTES = 1 << 20
+
+
+class TableForm(NamedTuple):
+    """The character between the columns of a table, its decimal sign, and the number of its columns."""
+
+    separator: str
+    decimal: str
+    columns: int
+
+    @property
+    def text(self) -> str:
+        """What is reported of it; empty for commas between columns."""
+        signs = {";": "semicolons", "\t": "tabs"}
+        comma = ", decimal comma" if self.decimal == "," else ""
+        return f"{signs[self.separator]} between columns{comma}" if self.separator in signs else ""
+
+
+def table_form(head: bytes, row: bytes) -> TableForm:
+    """Return the form of a table by its first line and first row.
+
+    Where semicolons or tabs part the columns, as in countries with a decimal comma, a comma in the row is a decimal
+    sign.
+    """
+    counts = {sign: head.count(sign.encode()) for sign in (",", ";", "\t")}
+    separator = max(counts, key=lambda sign: counts[sign])
+    return TableForm(separator, "," if separator != "," and b"," in row else ".", counts[separator] + 1)
+
+
+def csv_frame(path: Path) -> pd.DataFrame:
+    """Return the columns of a CSV file that a log can use; the first line names them.
+
+    Its `attrs` hold the form of the table, and the first names.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    ValueError
+        It is not a table: text that is not UTF-8, a line that names too many columns, or rows with more values or far
+        fewer.
+    """
+    import pandas as pd
+
+    with path.open("rb") as stream:
+        head = _next_line(stream)
+        if len(head) == LONGEST_HEAD_BYTES or head.count(b",") >= MOST_COLUMNS:
+            most = min(head.count(b","), MOST_COLUMNS)
+            raise ValueError(f"its first line has more than {most} columns")
+        first = _next_line(stream)
+        form = table_form(head, first)
+        if form.columns > MOST_COLUMNS:
+            raise ValueError(f"its first line has more than {MOST_COLUMNS} columns")
+        if _count(first, form) > _count(head, form):
+            raise ValueError("its rows have more values than its first line has names")
+        _check_cells(stream, form)
+    parts, names = [], list[object]()
+    with pd.read_csv(
+        path, skipinitialspace=form.separator != "\t", sep=form.separator, decimal=form.decimal, encoding="utf-8-sig",
+        index_col=False, chunksize=CELLS_AT_ONCE // form.columns,
+    ) as reader:  # fmt: skip
+        for part in reader:
+            names = names or list(part.columns)
+            parts.append(part[[column for column in part.columns if column in TABLE_COLUMNS]])
+    table = pd.concat(parts, ignore_index=True) if len(parts) > 1 else parts[0] if parts else pd.DataFrame()
+    table.attrs.update(form=form.text, names=names)
+    return table
+
+
+def _next_line(stream: BinaryIO) -> bytes:
+    """Return the next line that is not blank, at most `LONGEST_HEAD_BYTES` of it; blank at the end."""
+    while (line := stream.readline(LONGEST_HEAD_BYTES)) and not line.strip():
+        pass
+    return line
+
+
+def _count(line: bytes, form: TableForm) -> int:
+    """Return the number of values in a line."""
+    text = line.decode("utf-8", "replace").strip("\r\n")
+    try:
+        return len(next(csv.reader([text], delimiter=form.separator, skipinitialspace=form.separator != "\t"), []))
+    except csv.Error:
+        return form.columns
+
+
+def _check_cells(stream: BinaryIO, form: TableForm) -> None:
+    """Refuse a table with far more cells than values.
+
+    Raises
+    ------
+    ValueError
+        Its lines have few values, and its first line has many names.
+    """
+    stream.seek(0)
+    size = rows = 0
+    while piece := stream.read(_PIECE_BYTES):
+        size += len(piece)
+        rows += piece.count(b"\n") - piece.count(b"\n\n") - piece.count(b"\n\r\n")
+    if rows * form.columns > MOST_EMPTY * size + LEAST_CELLS:
+        raise ValueError(f"its first line names {form.columns} columns, and its rows have values in few of them")
