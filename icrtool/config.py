@@ -41,9 +41,9 @@ Place = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Delay = Annotated[float, msgspec.Meta(ge=-100, le=100)]
 Degrees = Annotated[float, msgspec.Meta(ge=-720, le=720)]
 SideScale = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
-Width = Annotated[float, msgspec.Meta(gt=0, le=20)]
+Width = Annotated[float, msgspec.Meta(ge=0.01, le=20)]
 SkidFactor = Annotated[float, msgspec.Meta(gt=0, le=100)]
-Radius = Annotated[float, msgspec.Meta(gt=0, le=5)]
+Radius = Annotated[float, msgspec.Meta(ge=0.001, le=5)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
 Longitude = Annotated[float, msgspec.Meta(ge=-180, le=360)]
@@ -386,7 +386,7 @@ def _parse_section(name: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
 
 
 def describe_key(section: str, key: str) -> str:
-    """Return the type of a key and its bounds, as in ``a number > 0 and ≤ 20``."""
+    """Return the type of a key and its bounds, as in ``a number ≥ 0.01 and ≤ 20``."""
     return _described(get_type_hints(SECTIONS[section], include_extras=True)[key])
 
 

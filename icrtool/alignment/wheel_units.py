@@ -137,9 +137,10 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
     Raises
     ------
     DataError
-        The robot does not move.
+        The robot does not move; or far less than the wheels.
     """
     gone = ""
+    laid_m = went_m = 0.0
     if windows is not None:
         track = windows.track
         if len(windows.begin) < FEWEST_ALIGNMENT_WINDOWS:
@@ -151,18 +152,25 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
         clear = np.maximum(laid, apart) > windows.length_m / 4
         if np.count_nonzero(clear) < FEWEST_ALIGNMENT_WINDOWS or float((~moved)[clear].mean()) <= STANDS_SHARE:
             return
+        laid_m, went_m = float(laid[clear].sum()), float(went[clear].sum())
         gone = f" ({track.travel[-1]:.0f} m)"
     elif not len(log.gnss.stamp_ns) or np.mean((log.wheels.left != 0.0) | (log.wheels.right != 0.0)) < TURNING_SHARE:
         return
     place = log.gnss.north_m + 1j * log.gnss.east_m
     away = np.abs(place - (np.median(place.real) + 1j * np.median(place.imag)))
     reach_m = float(np.percentile(away, 95))
-    if windows is None:
-        variance = (log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2
-        known = variance[np.isfinite(variance)]
-        noise_m = math.sqrt(float(np.median(known))) if len(known) else 0.0
-        if reach_m >= max(PARKED_M, PARKED_SIGMAS * noise_m):
-            return
+    variance = (log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2
+    known = variance[np.isfinite(variance)]
+    noise_m = math.sqrt(float(np.median(known))) if len(known) else 0.0
+    moves = reach_m >= max(PARKED_M, PARKED_SIGMAS * noise_m)
+    if moves and windows is None:
+        return
+    if moves and went_m > PARKED_M:
+        raise DataError(
+            log.name,
+            f"the wheels turn{gone} {laid_m / went_m:.3g} times as far as the positions show",
+            "is robot.wheel_radius_m, or the unit of the wheels (wheels.unit), too large by that factor?",
+        )
     raise DataError(
         log.name,
         f"the wheels turn{gone} and the robot does not move",

@@ -92,10 +92,12 @@ def _run() -> int:
             # A path that is too long, or on a disk that fails, where no command knows more about it.
             error(f"{LogText(str(err.filename))}: {err.strerror}" if isinstance(err, OSError) else str(err))
             return 1
-        except MemoryError:
-            from icrtool.cli.printing import error
-
-            error("memory: there is not enough; give it more (ulimit -v), or read a part of the log (--from, --to)")
+        except (MemoryError, ImportError, SystemError) as err:
+            # without memory, a library or a module may be loaded in part only
+            if not (isinstance(err, MemoryError) or _memory_is_limited()):
+                raise
+            advice = "give it more (ulimit -v), or read a part of the log (--from, --to)"
+            sys.stderr.write(f"Error: memory: there is not enough; {advice}\n")
             return 1
         except click.ClickException as err:
             err.show()
@@ -109,6 +111,15 @@ def _run() -> int:
         return INTERRUPTED
     # Asked for help, click returns a status; a command returns nothing.
     return status if isinstance(status, int) else 0
+
+
+def _memory_is_limited() -> bool:
+    """Return whether the address space of the process has a limit (``ulimit -v``)."""
+    with suppress(ImportError):
+        import resource
+
+        return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+    return False
 
 
 class _Unloaded:

@@ -18,6 +18,7 @@ import importlib
 import os
 import pkgutil
 import stat
+import struct
 import sys
 import tempfile
 import threading
@@ -112,6 +113,20 @@ _OBJECT_MAGICS = (b"\x7fELF", b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
 """First bytes of an object file: of Linux, macOS and Windows (two processors)."""
 
 
+_ELF_SECTIONS = struct.Struct("<40xQ10xHHH")
+"""Of the header of an ELF file (64 bits): place of the table of sections, size of an entry, number of entries."""
+
+
+def _is_object(content: bytes) -> bool:
+    """Return whether bytes are an object file up to its end: LLVM crashes on a part of one."""
+    if not content.startswith(_OBJECT_MAGICS) or len(content) < _ELF_SECTIONS.size:
+        return False
+    if not content.startswith(_OBJECT_MAGICS[0]):
+        return True
+    at, size, count, names = map(int, _ELF_SECTIONS.unpack_from(content))
+    return _ELF_SECTIONS.size <= at and at + size * count <= len(content) and size == 64 and names < count
+
+
 def _is_own(place: Path) -> bool:
     """Return whether nobody else may write a file or a folder: what is kept there is run."""
     if not hasattr(os, "geteuid"):
@@ -139,7 +154,7 @@ class MachineCode(NamedTuple):
             data = file.read_bytes() if _is_own(file) and _is_own(file.parent) else b""
             if hashlib.sha256(data[32:]).digest() == data[:32]:
                 name, result, content = data[32:].split(b"\n", 2)
-                if result.decode() in _RESULTS and content.startswith(_OBJECT_MAGICS):
+                if result.decode() in _RESULTS and _is_object(content):
                     return cls(name.decode(), result.decode(), content)
         return None
 

@@ -213,12 +213,17 @@ def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str,
 
 
 def _numbers(frame: pd.DataFrame, column: str, name: str) -> Floats:
-    """Return a column (n,), NaN where it is empty; as in messages, a number above `LARGEST_STATE` is infinite."""
+    """Return a column (n,), NaN where it is empty."""
     try:
-        values = np.asarray(frame[column], np.float64)
-        return np.where(np.abs(values) > LARGEST_STATE, np.copysign(np.inf, values), values)
+        return np.asarray(frame[column], np.float64)
     except (TypeError, ValueError, OverflowError) as err:
         raise DataError(name, f"column {column}: holds a value that is not a number", str(err)) from err
+
+
+def _values(frame: pd.DataFrame, column: str, name: str) -> Floats:
+    """Return a column (n,) of measurements: as in messages, a number above `LARGEST_STATE` is infinite."""
+    values = _numbers(frame, column, name)
+    return np.where(np.abs(values) > LARGEST_STATE, np.copysign(np.inf, values), values)
 
 
 def _rows(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) -> tuple[Ints, list[Floats]]:
@@ -235,14 +240,14 @@ def _rows(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) ->
     if len(stamps) < 2:
         raise DataError(name, f"{group}: {len(stamps)} rows have numbers in {' and '.join(columns)}", "two are needed")
     rows = len(np.flatnonzero(sound)) - 1 - last
-    return stamps, [np.ascontiguousarray(_numbers(frame, column, name)[sound][rows]) for column in columns]
+    return stamps, [np.ascontiguousarray(_values(frame, column, name)[sound][rows]) for column in columns]
 
 
 def _stamped(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) -> tuple[str, Floats, Bools]:
     """Return the column of stamps, its values [s] (rows,), and which rows have numbers in it and in `columns`."""
     (clock,) = _chosen(frame, CLOCK_COLUMNS, group, name)
     seconds = _numbers(frame, clock, name) * (1.0 if clock == "t_s" else 1e-9)
-    values = [seconds, *(_numbers(frame, column, name) for column in columns)]
+    values = [seconds, *(_values(frame, column, name) for column in columns)]
     return clock, seconds, np.logical_and.reduce(np.isfinite(values))
 
 
@@ -282,7 +287,7 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
 
 def _at(frame: pd.DataFrame, column: str, group: Sequence[str], stamps: Ints, name: str) -> Floats:
     """Return an optional column (n,) at the stamps of a group, NaN where it is empty."""
-    filled = frame[np.isfinite(_numbers(frame, column, name))]
+    filled = frame[np.isfinite(_values(frame, column, name))]
     out = np.full(len(stamps), np.nan)
     if len(filled) >= 2:
         at, values = _rows(filled, [*group, column], column, name)

@@ -525,7 +525,8 @@ def find(path: UrlPath) -> list[UrlPath]:
         There are none, or they cannot be listed.
     """
     address = without_secrets(path.url) if path.scheme.startswith("http") else path.url
-    if not re.search(r"[*\[]" if path.scheme.startswith("http") else r"[*?\[]", address):
+    wild = r"[*\[]" if path.scheme.startswith("http") else r"[*?\[]"
+    if not re.search(wild, address) or (not re.search(wild.replace("\\[", ""), address) and _is_there(path)):
         found = _below(path) if RemoteFile(path).is_folder else [path]
         if not found:
             suffixes = ", ".join(sorted(LOG_SUFFIXES))
@@ -542,6 +543,12 @@ def find(path: UrlPath) -> list[UrlPath]:
     if not found:
         raise LogError(path, "matches nothing")
     return sorted(set(found), key=natural_order)
+
+
+def _is_there(path: UrlPath) -> bool:
+    """Return whether there is a file of this very name, which may have brackets."""
+    files, name = filesystem(path)
+    return bool(asked(path, lambda: _in_time(files, "exists", name)))
 
 
 def _below(folder: UrlPath) -> list[UrlPath]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import shutil
@@ -103,6 +104,36 @@ def arguments(*, flag: bool = True, more: float | None = 0.5) -> tuple[Any, ...]
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Machine code of the tests' own functions is kept nowhere else."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"lag",
+        b"lag\nnone\n\x7fELF",
+        b"lag\nnone\n\x7fELF" + bytes(900),
+        b"lag\nnone\nno object",
+        b"\xff\nnone\n\x7fELF",
+    ],
+)
+def test_malformed_machine_code_with_the_right_digest_is_not_run(tmp_path: Path, content: bytes) -> None:
+    called(tmp_path)
+    [file] = tmp_path.iterdir()
+    file.write_bytes(hashlib.sha256(content).digest() + content)
+    assert called(tmp_path) == ["1.5", "1", "True"]
+
+
+@pytest.mark.parametrize("place", ["file", "folder"])
+def test_machine_code_that_everybody_may_write_is_not_run(tmp_path: Path, place: str) -> None:
+    called(tmp_path)
+    [file] = tmp_path.iterdir()
+    open_to_all = file if place == "file" else tmp_path
+    open_to_all.chmod(0o777)
+    assert called(tmp_path) == ["1.5", "1", "True"]
+    file.chmod(0o644)
+    tmp_path.chmod(0o700)
+    assert called(tmp_path) == ["1.5", "0", "False"]
 
 
 @pytest.mark.parametrize(

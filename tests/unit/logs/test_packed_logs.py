@@ -8,7 +8,9 @@ import hashlib
 import io
 import lzma
 import os
+import platform
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -32,7 +34,8 @@ from icrtool.fleet.recordings import find_recordings
 from icrtool.logs.containers import unpack
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.recording_files import log_name
-from icrtool.logs.read_log import csv_frame, read_log
+from icrtool.logs.csv_table import csv_frame
+from icrtool.logs.read_log import read_log
 
 SAMPLES = Path(__file__).parents[3] / "sample_logs"
 MCAP, BAG, DIRECTORY = (
@@ -417,3 +420,86 @@ def test_ctrl_c_while_unpacking_leaves_nothing_behind(tmp_path, temporary, log):
     one.stdin.close()
     one.stdout.close()
     one.stderr.close()
+
+
+def test_temporary_folders_state_host_and_process_and_those_of_dead_ones_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    host = re.sub(r"[^A-Za-z0-9.]", "_", platform.node())[:64]
+    kept = [f"icrtool-{host}-{os.getpid()}-a", f"icrtool-{host}x-{dead.pid}-a", f"icrtool-{host}-x-a", "icrtool-a"]
+    for name in (*kept, f"icrtool-{host}-{dead.pid}-a"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "log").touch()
+    scratch = unpack.ScratchFolder()
+    assert scratch.path.name.startswith(f"icrtool-{host}-{os.getpid()}-")
+    assert scratch.path.stat().st_mode & 0o777 == 0o700
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*kept, scratch.path.name])
+    scratch.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
+
+
+def test_long_targets_of_links_and_sparse_files_of_a_gnu_archive_hide_no_log(tmp_path):
+    path, whole = tmp_path / "x.tar", tmp_path / "x"
+    whole.mkdir()
+    shutil.copy(MCAP, whole / "drive.mcap")
+    with (whole / "map.dat").open("wb") as file:
+        for place in range(0, 30 << 20, 1 << 20):
+            file.seek(place)
+            file.write(b"x")
+    with tarfile.open(path, "w", format=tarfile.GNU_FORMAT) as archive:
+        for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE):
+            link = tarfile.TarInfo("b/" * 60 + "link.mcap")
+            link.type, link.linkname = kind, "a/" * 4000
+            archive.addfile(link)
+    subprocess.run(["tar", "--append", "--sparse", "--format=gnu", "-f", path, "-C", whole, "map.dat"], check=True)
+    subprocess.run(["tar", "--append", "--format=gnu", "-f", path, "-C", whole, "drive.mcap"], check=True)
+    assert path.stat().st_size < 4e6, "map.dat is stored with its holes left out"
+    assert content(path) == content(MCAP)
+    (whole / "map.dat").rename(whole / "map.mcap")
+    subprocess.run(["tar", "--create", "--sparse", "--format=gnu", "-f", path, "-C", whole, "map.mcap"], check=True)
+    with pytest.raises(LogError, match=r"map\.mcap is a sparse file; pack it without --sparse"):
+        open_log(path)
+
+
+def test_an_archive_of_thousands_of_folders_costs_little_time(tmp_path):
+    path = tmp_path / "x.tar"
+    with tarfile.open(path, "w") as archive:
+        for number in range(20_000):
+            folder = tarfile.TarInfo(f"folder{number}")
+            folder.type = tarfile.DIRTYPE
+            archive.addfile(folder)
+        archive.add(MCAP, "drive.mcap")
+    begin = time.process_time()
+    open_log(path).close()
+    assert time.process_time() - begin < 2.0 + path.stat().st_size / 1e6
+    with zipfile.ZipFile(tmp_path / "y.zip", "w") as archive:
+        for number in range(20_000):
+            archive.writestr(f"folder{number}/a.mcap", b"x")
+    begin = time.process_time()
+    with pytest.raises(LogError, match="more than 100 folders"):
+        open_log(tmp_path / "y.zip")
+    assert time.process_time() - begin < 3.0
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "no log in it", "a database cut off", "two parts"])
+def test_no_note_or_error_names_the_temporary_folder(tmp_path, temporary, damage):
+    path, whole = tmp_path / "drive.tar", tmp_path / "whole"
+    whole.mkdir()
+    parts = {
+        "cut": {"drive.mcap": MCAP.read_bytes()}, "empty": {"drive.mcap": b""}, "no log in it": {"drive.txt": b"x"},
+        "a database cut off": {"drive.db3": DB3.read_bytes()[:60_000], "metadata.yaml": b"rosbag2: ["},
+        "two parts": {"drive_0.mcap": MCAP.read_bytes(), "drive_1.mcap": b"x" * 99, "metadata.yaml": b"x"},
+    }[damage]  # fmt: skip
+    with tarfile.open(path, "w") as archive:
+        for name, data in parts.items():
+            (whole / name).write_bytes(data)
+            archive.add(whole / name, f"drive/{name}")
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:1_000_000])
+    try:
+        said = [*content(path)[1]]
+    except LogError as err:
+        said = [str(err)]
+    assert said
+    assert not [one for one in said if str(temporary) in one or "icrtool-" in one]

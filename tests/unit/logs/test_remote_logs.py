@@ -359,6 +359,16 @@ def test_patterns_folders_and_manifests_find_the_logs_of_a_bucket(fresh, tmp_pat
         find(UrlPath("s3://field/**/*.ulg"))
 
 
+def test_a_name_with_brackets_is_a_file_before_it_is_a_pattern(fresh):
+    fresh.client.upload_file(str(MCAP), "field", "odd/drive[1].mcap")
+    fresh.client.upload_file(str(MCAP), "field", "odd/drive2.mcap")
+    assert [one.url for one in find(UrlPath("s3://field/odd/drive[1].mcap"))] == ["s3://field/odd/drive[1].mcap"]
+    assert [one.url for one in find(UrlPath("s3://field/odd/drive[2].mcap"))] == ["s3://field/odd/drive2.mcap"]
+    assert messages(UrlPath("s3://field/odd/drive[1].mcap")) == messages(MCAP)
+    for name in ("odd/drive[1].mcap", "odd/drive2.mcap"):
+        fresh.client.delete_object(Bucket="field", Key=name)
+
+
 def run(monkeypatch, capfd, *arguments: object) -> tuple[int, str]:
     """Run a command in this process; return its exit status and all that it printed."""
     monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])

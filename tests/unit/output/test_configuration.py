@@ -54,4 +54,4 @@ def test_a_changed_configuration_comes_back() -> None:
 
 def test_bounds_stand_behind_the_value() -> None:
     line = shown(format_configuration(Config()), "robot", "track_width_m")
-    assert line.endswith("# a number > 0 and ≤ 20; no default, this is an example")
+    assert line.endswith("# a number ≥ 0.01 and ≤ 20; no default, this is an example")

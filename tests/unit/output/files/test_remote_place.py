@@ -17,6 +17,7 @@ import pytest
 import icrtool
 from icrtool.cli import main
 from icrtool.errors import OutputError, RunError
+from icrtool.output.files import remote_place
 from icrtool.output.files.remote_place import on_disk
 from icrtool.records.places import UrlPath
 from support.batches import in_this_process
@@ -255,3 +256,38 @@ def test_ctrl_c_while_a_run_is_uploaded_leaves_nothing_that_counts_and_no_tempor
         assert process.wait(30) == 130
     process.stderr.close()
     assert "B2SUMS" not in names(store, "runs/one/")
+
+
+FIT = ("fit", MCAP, *ROBOT, "-o", "s3://field/runs/one", "--plots", "none")
+
+
+def fit_apart() -> int:
+    """Fit the log in a process of its own, to the same address; return the exit status."""
+    command = [sys.executable, "-P", "-m", "icrtool", *map(str, FIT), "--smooth", "-q"]
+    return subprocess.run(command, check=False, capture_output=True, timeout=120).returncode
+
+
+@pytest.mark.parametrize("moment", ["upload", "_check_claim"])
+def test_of_two_commands_that_write_to_one_address_one_ends_with_an_error(store, monkeypatch, capfd, moment):
+    """The other command writes all of its run, or claims the place, between two steps of this one."""
+    step, others = getattr(remote_place._Store, moment), []
+
+    def after_the_other(self, *given):
+        if not others:
+            others.append(0)
+            if moment == "upload":
+                others[0] = fit_apart()
+            else:
+                self.put(b"of another command", remote_place._CLAIM)
+        return step(self, *given)
+
+    monkeypatch.setattr(remote_place._Store, moment, after_the_other)
+    status, said = run(monkeypatch, capfd, *FIT)
+    (line,) = [one for one in said.splitlines() if one.startswith("Error: ")]
+    assert (status, others) == (1, [0])
+    assert "s3://field/runs/one: another command" in line
+    if moment == "upload":
+        assert "smoothed.csv" in names(store, "runs/one/")
+        assert icrtool.open_run("s3://field/runs/one").document.request.smooth
+    else:
+        assert "B2SUMS" not in names(store, "runs/one/")
