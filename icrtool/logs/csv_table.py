@@ -22,7 +22,7 @@ MOST_EMPTY, LEAST_CELLS = 4, 1_000_000
 """Largest number of cells for each byte of a file, and the number that any file may have. pandas makes a cell for each
 column of each row, and rows of two bytes below thousands of names would fill the memory."""
 
-_PIECE_BYTES = 1 << 20
+_COUNTED_BYTES = 1 << 20
 
 
 class TableForm(NamedTuple):
@@ -117,7 +117,7 @@ def _check_cells(stream: BinaryIO, form: TableForm) -> None:
     """
     stream.seek(0)
     size = rows = 0
-    while piece := stream.read(_PIECE_BYTES):
+    while piece := stream.read(_COUNTED_BYTES):
         size += len(piece)
         rows += piece.count(b"\n") - piece.count(b"\n\n") - piece.count(b"\n\r\n")
     if rows * form.columns > MOST_EMPTY * size + LEAST_CELLS:

@@ -55,10 +55,10 @@ GYRO_COLUMNS = (("turn_rate_radps",), ("yaw_rate_radps",))
 HEADING_STD = (("heading_std_rad", 1.0), ("heading_std_deg", math.pi / 180))
 """Columns of the standard deviation of headings, and their units [rad]."""
 
-CLOCK_COLUMNS, HEIGHT = (("stamp_ns",), ("t_s",)), "height_m"
+CLOCK_COLUMNS, HEIGHT_COLUMN = (("stamp_ns",), ("t_s",)), "height_m"
 
 TABLE_COLUMNS = {
-    HEIGHT, *(name for name, _ in HEADING_STD),
+    HEIGHT_COLUMN, *(name for name, _ in HEADING_STD),
     *(name for group in (*WHEEL_COLUMN_UNITS, *POSITION, *POSITION_STD, *HEADING_COLUMNS, *GYRO_COLUMNS, *CLOCK_COLUMNS)
       for name in group),
 }  # fmt: skip
@@ -266,7 +266,7 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
     columns = _chosen(frame, POSITION, "position", name)
     stated = any(column in frame for pair in POSITION_STD for column in pair)
     stds = _chosen(frame, POSITION_STD, "position", name) if stated else ()
-    further = [column for column in dict.fromkeys((*stds, HEIGHT)) if column in frame]
+    further = [column for column in dict.fromkeys((*stds, HEIGHT_COLUMN)) if column in frame]
     stamps, (first, second) = _rows(frame, columns, "position", name)
     extra = {column: _at(frame, column, columns, stamps, name) for column in further}
     unknown, datum, north, east = np.full(len(stamps), np.nan), None, first, second
@@ -275,7 +275,7 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
 
         if np.any(np.abs(first) > 90) or np.any(np.abs(second) > 360):
             raise DataError(name, "column latitude_deg or longitude_deg: not degrees", "are they in radians, or E7?")
-        height = np.nan_to_num(extra.get(HEIGHT, unknown))
+        height = np.nan_to_num(extra.get(HEIGHT_COLUMN, unknown))
         datum = Datum(float(first[0]), float(second[0]), float(height[0]))
         north, east, _ = geodetic2ned(first, second, height, datum.latitude_deg, datum.longitude_deg, datum.height_m)
     # The square of a standard deviation that is no real one may overflow.
