@@ -39,8 +39,8 @@ from icrtool.records.notes import Note
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
 from icrtool.records.samples import InputFile
 
-MOST_CHANNELS = 2048
-"""Largest number of channels that are read: topics, and for a ROS 1 bag publishers. Each takes some 0.5 ms."""
+MOST_CHANNELS = 1024
+"""Largest number of channels that are read: topics, and for a ROS 1 bag publishers. Each takes 0.5 to 2 ms."""
 
 MOST_FILES = 5000
 """Largest number of files of a recording. One of three days with a file for each minute has 4,320; each takes about 1

@@ -131,7 +131,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     notes += clock_notes([(role, one.stamps) for role, one in chosen.items()], name)
     spread, of_bursts = _spread(position, clock)
     notes += of_bursts
-    if source is not None and source.topic == position.topic:
+    if source is not None and (source.topic, source.message_type) == (position.topic, position.message_type):
         source = replace(source, stamps=spread)
     position = replace(position, stamps=spread)
     notes += _far_datum(position, config)

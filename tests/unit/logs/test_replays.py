@@ -27,10 +27,10 @@ SECOND_NS = 1_000_000_000
 Again = Callable[[int], list[int]]
 
 
-def record(path: Path, times_of: Again, *, change: bool = False) -> Path:
+def record(path: Path, times_of: Again, *, change: bool = False, topic: str = "") -> Path:
     """Write the first 40 s of a log, each message at all log times that `times_of` gives for its time since the start.
 
-    `change`: each message differs from the one that it repeats.
+    `change`: each message differs from the one that it repeats; `topic`: name of all topics, in place of their own.
     """
     kept = []
     with LOG.open("rb") as stream:
@@ -54,7 +54,7 @@ def record(path: Path, times_of: Again, *, change: bool = False) -> Path:
             if channel.id not in channels:
                 if schema.id not in schemas:
                     schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[schema.id])
+                channels[channel.id] = writer.register_channel(topic or channel.topic, "cdr", schemas[schema.id])
             writer.add_message(channels[channel.id], time_ns, data, time_ns)
         writer.finish()
     return path
@@ -153,3 +153,9 @@ def test_a_single_log_time_beyond_any_possible_time_is_left_out(tmp_path: Path, 
     log = read_log(path, CONFIG)
     assert "log_time_impossible" not in codes(log)
     assert 0 < len(once.wheels.stamp_ns) - len(log.wheels.stamp_ns) < 5
+
+
+def test_streams_of_several_types_on_one_topic_keep_their_own_stamps(tmp_path: Path, once: RobotLog) -> None:
+    log = read_log(record(tmp_path / "a.mcap", lambda t: [BEGIN_NS + t], topic="/all"), CONFIG)
+    assert [stream.topic for stream in log.streams] == ["/all"] * 3
+    assert_same(log, once)
