@@ -106,7 +106,7 @@ def find_changes(fit: AlignmentFit) -> GroundChanges | None:
     for count in ranked:
         if count == 0:
             return None
-        stretches = _stretches(turns, ways[count])
+        stretches = _stretches(turns, _refined(turns, ways[count], places))
         if stretches is not None:
             return GroundChanges(stretches)
     return None
@@ -165,6 +165,22 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
         ways.append([0, *(int(places[row]) for row in reversed(rows))])
         costs.append(float(best[-1]))
     return ways, costs
+
+
+def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
+    """Return rows that divide the windows, each moved between the places around it to where least is left."""
+    xx, xy, yy = (np.append(0.0, np.cumsum(one)) for one in (turns.x**2, turns.x * turns.y, turns.y**2))
+
+    def left(first: Ints | int, stop: Ints | int) -> Floats:
+        square = np.maximum(xx[stop] - xx[first], 1e-12)
+        return np.asarray(yy[stop] - yy[first] - (xy[stop] - xy[first]) ** 2 / square)
+
+    found = list(rows)
+    for i in range(1, len(rows) - 1):
+        at = int(np.searchsorted(places, rows[i]))
+        tried = np.arange(max(int(places[at - 1]), found[i - 1]) + 1, min(int(places[at + 1]), rows[i + 1]))
+        found[i] = int(tried[np.argmin(left(found[i - 1], tried) + left(tried, rows[i + 1]))])
+    return found
 
 
 def _stretches(turns: _Turns, rows: list[int]) -> tuple[GroundStretch, ...] | None:

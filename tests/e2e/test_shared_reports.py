@@ -62,7 +62,7 @@ def test_a_change_of_ground_is_two_stretches(shared_logs: Path, name: str, multi
     assert run.document.partly_because is not None
     assert "--terrain-change" in run.document.partly_because
     if name == "ground0.8":
-        assert stretches[1].begin_s == pytest.approx(100.0, abs=10.0)
+        assert stretches[1].begin_s == pytest.approx(100.0, abs=5.0)
 
 
 def test_a_jump_of_the_datum_is_no_distance_that_was_driven(shared_logs: Path) -> None:

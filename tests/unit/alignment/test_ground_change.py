@@ -91,7 +91,7 @@ def test_two_and_three_changes_are_named_each_with_its_stretch(changes: list[tup
     stretches = run.document.wheels.ground_stretches
     assert len(stretches) == len(changes) + 1
     for one, (factor, at_s) in zip(stretches, [(1.0, 0.0), *changes], strict=True):
-        assert one.begin_s == pytest.approx(at_s, abs=15.0)
+        assert one.begin_s == pytest.approx(at_s, abs=8.0)
         assert abs(one.multiplier - factor * BEFORE) < max(4.0 * one.multiplier_std, 0.04)
     for before, after in pairwise(stretches):
         assert before.end_s == after.begin_s
