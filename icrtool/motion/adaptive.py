@@ -34,8 +34,8 @@ from icrtool.motion.window_fit import (
 )
 
 WINDOWS_AS_ONE = 80.0
-"""Number of windows that count as one independent window. A stretch of 20 m holds 160 windows and shows a term about
-twice."""
+"""Number of windows that count as one independent window. A stretch of 20 m holds 120 windows and shows a term between
+one and two times."""
 
 GAUSS_NEWTON_STEPS = 3
 """Steps from one solution to the next."""
@@ -61,8 +61,9 @@ LARGEST_DELAY_S = 0.4
 FEWEST_FOR_WANDER = 60
 """Number of windows from which on the wander of the heading is estimated. Fewer windows show the prior's error."""
 
-USUAL_STD = (0.03, 0.03)
-"""Spread of residuals before a drive, of displacements [m^0.5] and of turns [rad/m^0.5]."""
+USUAL_STD = (0.02, 0.02)
+"""Spread of residuals before a drive, of displacements [m^0.5] and of turns [rad/m^0.5]. With 0.03 the expected error
+after 10 m is 3 % larger on 18 simulated robots of which nothing is known."""
 
 USUAL_COUNTS_AS = 4.0
 """Number of independent windows that `USUAL_STD` counts as. The first few windows are always fitted almost exactly, so

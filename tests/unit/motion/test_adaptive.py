@@ -130,9 +130,7 @@ class Transcription:
             due = knot * 0.5 + min(max(0.02 * knot * 0.5, 0.5), 6.0)
             last = max(k for k, one in enumerate(self.knots) if self.track.t[one] <= self.track.t[row] - 0.5)
             anew = knot * 0.5 >= anew_at
-            windows = [
-                (e - n, e, n / 2.0) for n in (2, 4, 10, 20) for e in range(max(0 if anew else used, n), last + 1)
-            ]
+            windows = [(e - n, e, n / 2.0) for n in (2, 4, 10) for e in range(max(0 if anew else used, n), last + 1)]
             if not windows:
                 continue
             used = last + 1
@@ -146,7 +144,7 @@ class Transcription:
                     values, by = (values, by) if step == 0 else self.linearised(windows, at)
                     mad = [1.4826 * np.median(np.abs(values[rows])) for rows in ([0, 1], [2])]
                     count = len(windows) / 80.0
-                    scale = [math.sqrt((count * one**2 + 4.0 * 0.03**2) / (count + 4.0)) for one in mad]
+                    scale = [math.sqrt((count * one**2 + 4.0 * 0.02**2) / (count + 4.0)) for one in mad]
                 added = self.equations(values, by, scale, at, x)
                 x = np.linalg.solve(inverse + matrix + added[0], inverse @ mean + vector + added[1])
             added = self.equations(values, by, scale, at, x)
