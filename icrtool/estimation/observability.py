@@ -18,7 +18,6 @@ from icrtool.kernels.window_residuals import path_at, window_residuals
 from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.notes import Note, note
 from icrtool.records.plain_data import known
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, width_or_usual_m
 from icrtool.records.run_document import ExcitationDocument, Excited, NumberByIcr, VerdictByIcr
 from icrtool.records.tables import States
@@ -100,7 +99,6 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
     parameters, by_icrs = parameters_of_icrs(np.array([right, left, x]), WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
-    give_back_freed()
 
     def twists(some: slice) -> tuple[Floats, Ints, Floats]:
         return model_columns(FULL_LINEAR, wheel_motion(track.v_left[some], track.v_right[some], WIDTH_M))

@@ -30,7 +30,6 @@ from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutpu
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import IcrStart, SensorData
 from icrtool.records.presets import ProcessNoise
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import States
@@ -203,9 +202,7 @@ def run_adaptively(
     """
 
     def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterParameters, FilterOutput]:
-        # The rest of the set-up is, of a long log, as large as three columns of the states.
         setup = set_up_filter(one, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
-        give_back_freed()
         return setup.parameters, run_ekf(*setup)
 
     noise, settings = configured_noise(config), config.filter

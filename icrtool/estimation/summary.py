@@ -35,7 +35,6 @@ from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
 from icrtool.records.notes import Note, about, note, unusable_because, warnings_of
 from icrtool.records.plain_data import known
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import FitRequest
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, track_of_states
 from icrtool.records.run_document import (
@@ -88,7 +87,6 @@ def summarise(
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation, x_clock_std_m = learned(filtered, config, sensors.facts.clock_std_s)
-    give_back_freed()
     multiplier = None if width is None else (separation_multiplier(table, width), multiplier_std(covariance, width))
     inverted = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1])
     rules = config.filter.rules
