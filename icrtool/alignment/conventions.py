@@ -164,13 +164,19 @@ class NamedFit(NamedTuple):
 
     Attributes
     ----------
-    scatter : robust scatter of the displacements, as a share of their length; offset_rad : of the heading
+    residuals : (k,) of the displacements, as a share of their length; scatter : their robust scatter
+    offset_rad : of the heading
     turn_sigmas : turn of the heading by the wheels, clockwise for a faster left side, in standard deviations
     """
 
+    residuals: Floats
     scatter: float
     offset_rad: float
     turn_sigmas: float
+
+    def cost(self, scatter: float) -> float:
+        """Return twice the negative log-likelihood with some scatter; overlapping windows count once."""
+        return soft_l1_loss(self.residuals / scatter) / STARTS_A_WINDOW
 
     @classmethod
     def of(cls, windows: DriveWindows) -> NamedFit:
@@ -180,7 +186,7 @@ class NamedFit(NamedTuple):
         shown = _show(windows, laid, 1)
         std = math.sqrt(max(float(shown.turn_covariance[0, 0]), 1e-24))
         offset = math.atan2(float(shown.z[1]), float(shown.z[0]))
-        return cls(float(mad_std(shown.residuals, 0.0)), offset, float(shown.turn[0]) / std)
+        return cls(shown.residuals, float(mad_std(shown.residuals, 0.0)), offset, float(shown.turn[0]) / std)
 
 
 def senses_by_distance(track: Track) -> Convention:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from icrtool.alignment.clock_search import with_configured_delays
-from icrtool.alignment.conventions import NamedFit, gyro_sense
+from icrtool.alignment.conventions import DECISIVE, NamedFit, gyro_sense
 from icrtool.alignment.log_track import FEWEST_OVERLAPPING, check_streams, windows_of_log
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
@@ -19,12 +19,6 @@ from icrtool.records.tables import RobotLog
 
 WITNESS_SIGMAS = 5.0
 """Turn of the heading by the wheels, in its standard deviations, from which on both turn in one sense."""
-
-BETTER_FIT_RATIO = 0.5
-"""Ratio of the scatter of displacements with and without exchanged axes below which the axes are exchanged."""
-
-EQUAL_FIT_RATIO = 1.1
-"""Ratio of the scatters of two exchanges up to which the heading's offset decides between them."""
 
 EARTH_RADIUS_M, EARTH_ECCENTRICITY_2 = 6_378_137.0, 6.694379990141e-3
 """Equatorial radius [m] and squared eccentricity of the ellipsoid WGS 84."""
@@ -60,14 +54,18 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
         fixes = one.gnss
         track = windows.track._replace(north=fixes.north_m, east=fixes.east_m)
         found.append((NamedFit.of(replace(windows, track=track)), words, one))
-    least = min((fit.scatter for fit, _, _ in found), default=math.inf)
-    if not least < BETTER_FIT_RATIO * as_sent.scatter:
+    scatter = min((fit.scatter for fit, _, _ in found), default=0.0)
+    scatter = max(scatter, 0.5 * windows.track.place_std_m / float(windows.length_m[0]))
+    costs = [fit.cost(scatter) for fit, _, _ in found]
+    gain = as_sent.cost(scatter) - min(costs, default=math.inf)
+    if not gain > DECISIVE:
         return log
-    near = [one for one in found if one[0].scatter <= EQUAL_FIT_RATIO * least]
+    # of exchanges that fit alike the offset of the heading decides
+    near = [one for one, cost in zip(found, costs, strict=True) if cost < min(costs) + DECISIVE]
     _, words, right = min(near, key=lambda one: abs(one[0].offset_rad))
     why = (
-        f"the positions turn in the opposite sense to gyro, heading and wheels, which agree: {words}; corrected: the "
-        f"displacements scatter by {100 * least:.1f} % of their length in place of {100 * as_sent.scatter:.0f} %"
+        f"the positions turn in the opposite sense to gyro, heading and wheels, which agree: {words}; corrected "
+        f"(twice the gain in log-likelihood {gain:.0f}, decisive from {DECISIVE:.0f} on)"
     )
     return replace(right, notes=(*right.notes, note("positions_mirrored", why, log.name)))
 

@@ -106,3 +106,39 @@ def test_metres_per_radian_are_those_of_another_library(latitude_deg: float) -> 
     _, east, _ = geodetic2ned(latitude_deg, 10.0 + step_deg, 0.0, latitude_deg, 10.0, 0.0)
     by_library = float(north) / np.radians(step_deg), float(east) / np.radians(step_deg)
     assert metres_per_radian(latitude_deg) == pytest.approx(by_library, rel=1e-6)
+
+
+def lawn_log() -> RobotLog:
+    """Return straight lines of 20 m with a half turn at each end, to the right and to the left by turns."""
+    t = np.arange(0.0, 360.0, 0.02)
+    phase = t % 30.0
+    turn = np.where(phase > 24.0, np.pi / 6.0, 0.0) * np.where((t // 30.0) % 2 < 1.0, 1.0, -1.0)
+    left, right = 0.8 - ICRS[1] * turn, 0.8 - ICRS[0] * turn
+    log, rng = log_of(), np.random.default_rng(0)
+    psi = 0.1 + np.append(0.0, np.cumsum(turn[:-1] * 0.02))
+    step = np.exp(1j * psi) * (0.8 - 1j * ICRS[2] * turn) * 0.02
+    place = np.append(0.0, np.cumsum(step[:-1]))[::5]
+    stamps = EPOCH_NS + np.round(t * 1e9).astype(np.int64)
+    noise, var = rng.normal(0.0, 0.014, (2, len(place))), np.full(len(place), 0.014**2)
+    heading = np.angle(np.exp(1j * (psi + rng.normal(0.0, 0.01, len(t)))))
+    assert log.gyro is not None
+    return replace(
+        log,
+        wheels=replace(log.wheels, stamp_ns=stamps, left=left, right=right),
+        gnss=replace(
+            log.gnss, stamp_ns=stamps[::5], north_m=place.real + noise[0], east_m=place.imag + noise[1],
+            var_north_m2=var, var_east_m2=var.copy(), cov_north_east_m2=np.zeros(len(place)),
+        ),
+        heading=replace(log.heading, stamp_ns=stamps, heading_rad=heading, var_rad2=np.full(len(t), 1e-4)),
+        gyro=GyroSamples("/imu", stamps, turn + rng.normal(0.0, 0.01, len(t))),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("how", "words"), SPOILT)
+def test_few_turns_between_long_lines_are_enough(how: dict[str, int], words: str) -> None:
+    log = lawn_log()
+    assert with_right_positions(log, CONFIG) is log
+    found = with_right_positions(read_as(log, **how), CONFIG)
+    assert [one.code for one in found.notes] == ["positions_mirrored"]
+    assert words in found.notes[0].text
+    np.testing.assert_allclose(found.gnss.east_m, log.gnss.east_m, atol=5e-3)
