@@ -8,17 +8,23 @@ are killed where a compiled loop does not come back.
 from __future__ import annotations
 
 import argparse
+import bz2
 import gc
+import gzip
+import io
+import lzma
 import resource
 import shutil
 import signal
 import sqlite3
 import struct
 import sys
+import tarfile
 import tempfile
 import time
 import traceback
 import warnings
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -273,7 +279,54 @@ NO_METADATA = 0.7
 """Share of SQLite files that are read without their metadata.yaml, which takes most of the time."""
 
 
+PACKED_LOGS = 0.1
+"""Share of logs that are packed, and damaged once more as archives or compressed files."""
+
+
 def make_log(folder: Path, rng: Random) -> tuple[Path, list[str]]:
+    """Write a log as `make_plain` does, packed or not; return it with what was done."""
+    path, done = make_plain(folder, rng)
+    if rng.random() >= PACKED_LOGS:
+        return path, done
+    kind = str(rng.choice(["gz", "bz2", "xz", "zst", "lz4", "tar", "tgz", "zip"]))
+    target = path.parent / f"{path.name}.{kind}"
+    target.write_bytes(packed(path, kind))
+    if rng.random() < 0.7:
+        content = bytearray(target.read_bytes())
+        done = [*done, *(str(BYTE_MUTATIONS[int(rng.integers(4))](content, rng)) for _ in range(2))]
+        target.write_bytes(content)
+    return target, [kind, *done]
+
+
+def packed(path: Path, kind: str) -> bytes:
+    """Return a log as a compressed file, or as an archive."""
+    if kind in ("tar", "tgz", "zip") or path.is_dir():
+        sink = io.BytesIO()
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        if kind == "zip":
+            with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
+                for file in files:
+                    archive.write(file, f"{path.name}/{file.name}")
+        else:
+            with tarfile.open(fileobj=sink, mode="w:gz" if kind == "tgz" else "w") as archive:
+                for file in files:
+                    archive.add(file, f"{path.name}/{file.name}")
+        if kind in ("tar", "tgz", "zip"):
+            return sink.getvalue()
+        content = sink.getvalue()
+    else:
+        content = path.read_bytes()
+    import lz4.frame
+    import zstandard
+
+    made: dict[str, Callable[[bytes], bytes]] = {
+        "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress, "zst": zstandard.compress,
+        "lz4": lz4.frame.compress,
+    }  # fmt: skip
+    return made[kind](content)
+
+
+def make_plain(folder: Path, rng: Random) -> tuple[Path, list[str]]:
     """Write a short drive in a random container and damage it; return it with what was done."""
     from dataclasses import asdict
 

@@ -64,3 +64,10 @@ def test_an_action_by_a_tag_or_a_job_with_all_permissions_is_found(tmp_path: Pat
     text = re.sub(*change, (ROOT / ".github" / "workflows" / "check.yml").read_text(encoding="utf-8"))
     [wrong] = written(tmp_path / ".github" / "workflows", [text])
     assert check("zizmor", "--offline", "--no-progress", wrong).returncode != 0
+
+
+@pytest.mark.parametrize("file", [".github/actions/icrtool/action.yml", ".gitlab/icrtool-job.yml"])
+def test_logs_stand_behind_two_dashes_so_that_none_is_an_option(file: str) -> None:
+    calls = re.findall(r"icrtool batch .*?\$LOGS", (ROOT / file).read_text(encoding="utf-8"), re.DOTALL)
+    assert len(calls) == 1
+    assert calls[0].endswith(" -- $LOGS")

@@ -81,7 +81,7 @@ def csv_frame(path: Path) -> pd.DataFrame:
     parts, names = [], list[object]()
     with pd.read_csv(
         path, skipinitialspace=form.separator != "\t", sep=form.separator, decimal=form.decimal, encoding="utf-8-sig",
-        index_col=False, chunksize=CELLS_AT_ONCE // form.columns,
+        index_col=False, compression=None, chunksize=CELLS_AT_ONCE // form.columns,
     ) as reader:  # fmt: skip
         for part in reader:
             names = names or list(part.columns)

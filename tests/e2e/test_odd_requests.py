@@ -62,6 +62,13 @@ def test_a_wheel_radius_nine_times_too_large_is_no_stand(icrtool) -> None:
     assert "8.87 times as far as the positions show; is robot.wheel_radius_m" in error_of(said)
 
 
+def test_a_log_named_as_an_option_is_a_log_behind_two_dashes(icrtool, run_place: Path) -> None:
+    (run_place / "--config=cfg.mcap").write_bytes(MOWER.read_bytes())
+    status, said, _ = icrtool("info", *ROBOT, "--", "--config=cfg.mcap")
+    assert status == 0
+    assert "can be fitted" in said
+
+
 def test_standard_input_that_was_closed_is_one_line() -> None:
     command = ["sh", "-c", 'exec "$@" <&-', "sh", *COMMAND, "info", "-", "-q"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

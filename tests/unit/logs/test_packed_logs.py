@@ -29,7 +29,7 @@ import pytest
 import zstandard
 
 from icrtool.config import load_config
-from icrtool.errors import LogChangedError, LogError
+from icrtool.errors import IcrToolError, LogChangedError, LogError
 from icrtool.fleet.recordings import find_recordings
 from icrtool.logs.containers import unpack
 from icrtool.logs.containers.open_log import open_log
@@ -420,6 +420,16 @@ def test_ctrl_c_while_unpacking_leaves_nothing_behind(tmp_path, temporary, log):
     one.stdin.close()
     one.stdout.close()
     one.stderr.close()
+
+
+@pytest.mark.parametrize("packing", [*PACKERS, ".zip"])
+@pytest.mark.parametrize("data", [b"a,b\n1,2\n", b"\xfd7zXX" * 99])
+def test_a_table_that_is_not_packed_as_its_name_says_is_one_line(tmp_path, packing, data):
+    path = tmp_path / f"log.csv{packing}"
+    path.write_bytes(data)
+    with pytest.raises(IcrToolError) as error:
+        read_log(path, CONFIG)
+    assert len(str(error.value).splitlines()) == 1
 
 
 def test_temporary_folders_state_host_and_process_and_those_of_dead_ones_are_removed(tmp_path, monkeypatch):
