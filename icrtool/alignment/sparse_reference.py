@@ -11,7 +11,7 @@ from icrtool.kernels.arrays import Bools, Floats, Ints, wrapped
 from icrtool.kernels.track import Track
 from icrtool.records.notes import note
 from icrtool.records.samples import HeadingSamples
-from icrtool.records.tables import RobotLog
+from icrtool.records.tables import LARGEST_STATE, RobotLog
 
 SPARSE_S = 0.5
 """Usual interval between headings above which they are carried by the wheels [s]. Turns are compared over 1 s, which a
@@ -107,6 +107,11 @@ def without_interpolated(log: RobotLog) -> RobotLog:
     fixes, wheels = log.gnss, log.wheels
     stamps = fixes.stamp_ns
     if len(stamps) < FEWEST_IN_CURVES or len(wheels.stamp_ns) < 2:
+        return log
+    columns = fixes.north_m, fixes.east_m, wheels.left, wheels.right, log.heading.heading_rad
+    in_order = all((np.diff(one.stamp_ns) >= 0).all() for one in (fixes, wheels, log.heading))
+    if not in_order or not all((np.abs(one) < LARGEST_STATE).all() for one in columns):
+        # damaged streams are refused later, with their reason
         return log
     t, place = (stamps - stamps[0]) / 1e9, fixes.north_m + 1j * fixes.east_m
     bend, step = _bends(t, place)

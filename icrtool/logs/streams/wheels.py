@@ -16,7 +16,7 @@ from icrtool.config import Config
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, unwrapped
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.positions import REFERENCE_WORDS
+from icrtool.logs.streams.positions import LARGEST_PLACE_M, REFERENCE_WORDS
 from icrtool.logs.streams.sources import NEVER_MOVES, Sides, WheelSource, motion_of, moves, of_topic
 from icrtool.records.notes import Note, note
 from icrtool.records.samples import WheelUnit
@@ -311,8 +311,10 @@ def travelled_by(x: Floats, y: Floats, qx: Floats, qy: Floats, qz: Floats, qw: F
 
     The distance of a step is its displacement along the heading in its middle: exact to the second order on an arc.
     """
-    sound = np.isfinite(x) & np.isfinite(y) & np.isfinite(qx + qy + qz + qw) & (qz**2 + qw**2 > 0.0)
-    if np.count_nonzero(sound) < len(x) or len(x) < 2:
+    sizes = [np.abs(one) for one in (x, y, qx, qy, qz, qw)]
+    # a rotation of size 1, and places within LARGEST_PLACE_M, so that squares do not overflow
+    sound = np.logical_and.reduce([size < LARGEST_PLACE_M for size in sizes]) & (np.maximum(sizes[4], sizes[5]) > 0.0)
+    if len(x) < 2 or not sound.all():
         return None
     yaw = unwrapped(np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2))
     middle, turn = (yaw[1:] + yaw[:-1]) / 2.0, np.diff(yaw)
