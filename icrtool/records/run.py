@@ -348,8 +348,9 @@ def vendor_icrs(document: RunDocument) -> Icrs | None:
 
 
 def track_of(run: Run) -> Track:
-    """Return the states of a run as a track."""
-    return track_of_states(run.table, run.in_gap, run.outages_ns, jumping=run.jumping, slipping=run.slipping)
+    """Return the states of a run as a track, in which no trial crosses a gap or a state that it left uncertain."""
+    unknown = run.in_gap | _unrecovered(run.table, run.in_gap)
+    return track_of_states(run.table, unknown, run.outages_ns, jumping=run.jumping, slipping=run.slipping)
 
 
 RECOVERED_RATIO = 2.0
@@ -386,7 +387,6 @@ def track_of_states(
     held = np.zeros(len(table))
     np.divide(np.diff(table.stamp_ns), 1e9, out=held[:-1])
     held[in_gap] = 0.0
-    held[_unrecovered(table, in_gap)] = 0.0
     return Track.of_states(
         table.t_s, held, table.v_left_mps, table.v_right_mps, table.north_m, table.east_m, table.heading_rad,
         table.distance_m, in_outage=in_outage, jump=jumping, slipping=slipping,
