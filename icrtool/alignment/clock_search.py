@@ -43,7 +43,7 @@ LEAP_S = 18.0
 
 
 class Shifts(NamedTuple):
-    """Times by which streams are stamped later than the wheels [s], already taken off the stamps.
+    """Times by which streams are stamped later than the wheels [s], already subtracted from the stamps.
 
     Attributes
     ----------
@@ -231,7 +231,7 @@ def find_shift(wheels: _Rates, other: _Rates) -> float:
         if own is None or seen is None:
             continue
         r2, count = _correlations(own, seen, lags)
-        # one number of pairs for all lags, because the overlap of streams does not show their clocks
+        # the same number of pairs for all lags: a longer overlap of streams is no evidence of a lag
         gain -= count.max() * GRID_S / INDEPENDENT_S * np.log1p(-np.minimum(r2, LARGEST_R2))
         best_r = np.maximum(best_r, np.sqrt(r2))
     at = int(gain.argmax())

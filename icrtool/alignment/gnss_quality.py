@@ -125,7 +125,10 @@ def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Boo
 
 
 def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
-    """Return variances (m, 2) of fixes that are not fixed: at least their class's, times the number with one error."""
+    """Return the variances (m, 2) of fixes that are not fixed.
+
+    A variance is at least the variance of the class of the fix, times the number of fixes that share one error.
+    """
     least = np.select([kinds == code for code in CLASS_STD_M], list(CLASS_STD_M.values()), 0.0)[:, None]
     interval = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else 0.0
     alike = max(1.0, 2.0 * CORRELATION_S / interval) if interval > 0 else 1.0

@@ -23,15 +23,17 @@ MOST_CHANGES = 3
 """Largest number of changes of ground in a drive."""
 
 CHANGE_SIGMAS, CHANGE_SHARE = 5.0, 0.1
-"""Stretches that follow each other differ where by more than both: the best of many candidates differs by
-more than 3 sigma by chance, and few groups show a deviation that is itself uncertain."""
+"""Least difference of the ratios of two successive stretches: in standard deviations, and as a share of the larger
+ratio; both must be exceeded. The best of many candidates differs by more than 3 sigma by chance, and a standard
+deviation from few groups is itself uncertain."""
 
 LEAST_MULTIPLIER = 0.8
 """Smallest multiplier of a stretch. If the robot turns more than its wheels, the cause is not the ground but sides,
 units or another robot's wheels."""
 
 CHANGE_GAIN = 25.0
-"""Twice the log-likelihood that a change gains, with an observation for two windows, which overlap: five sigma."""
+"""Least gain of twice the log-likelihood by one more change: five sigma. Two windows count as one observation, because
+they overlap."""
 
 
 class GroundChanges(NamedTuple):
@@ -70,7 +72,7 @@ def _joined(texts: list[str]) -> str:
 
 
 class _Turns(NamedTuple):
-    """Begins of windows (n,) [s], turn of the wheels and of the heading in them [rad], their group of time."""
+    """Windows (n,): `begin` [s], turn `x` of the wheels and `y` of the heading [rad], number of their group of time."""
 
     begin: Floats
     x: Floats
@@ -101,7 +103,7 @@ def find_changes(fit: AlignmentFit) -> GroundChanges | None:
     places = np.unique(np.concatenate([[0], places[(places > 0) & (places < len(turns.x))], [len(turns.x)]]))
     ways, costs = _best_partitions(turns, places)
     likelihood = [len(turns.x) / 2 * math.log(max(cost, 1e-12)) for cost in costs]
-    # the most likely number of changes first; the others where its stretches do not show themselves
+    # the most likely number of changes first; the next one where a stretch does not show its ratio
     ranked = sorted(range(len(ways)), key=lambda count: likelihood[count] + CHANGE_GAIN * count)
     for count in ranked:
         if count == 0:
@@ -168,7 +170,7 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
 
 
 def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
-    """Return rows that divide the windows, each moved between the places around it to where least is left."""
+    """Return rows that divide the windows, each moved to the smallest sum of squares between its neighbours."""
     xx, xy, yy = (np.append(0.0, np.cumsum(one)) for one in (turns.x**2, turns.x * turns.y, turns.y**2))
 
     def left(first: Ints | int, stop: Ints | int) -> Floats:
@@ -205,7 +207,7 @@ def _stretches(turns: _Turns, rows: list[int]) -> tuple[GroundStretch, ...] | No
 
 
 def _ratio(turns: _Turns) -> tuple[float, float] | None:
-    """Return turn per turn of the wheels, and its deviation; None with too few groups."""
+    """Return the heading's turn per turn of the wheels, and its standard deviation; None with too few groups."""
     x, y = turns.x, turns.y
     turning = np.unique(turns.group[np.abs(x) > math.radians(5.0)])
     square = float(x @ x)

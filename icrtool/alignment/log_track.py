@@ -53,7 +53,7 @@ CHORD_S, LEAST_CHORD_M = 2.0, 0.3
 """Time over which distances are compared without a heading [s], and the shortest chord that is compared [m]."""
 
 STANDS_S = 5.0
-"""Time from a turn of the wheels beyond which the robot stands when a heading is measured [s]."""
+"""Longest time from a heading to the nearest motion of the wheels [s]; beyond it the robot counts as standing."""
 
 MOST_WHEEL_SAMPLES = 25_000
 """Approximate number of samples to which the wheel samples of a longer drive are joined: 1 h at 7 Hz."""
@@ -103,7 +103,7 @@ def track_of_streams(
     wheels: WheelSamples, gnss: PositionFixes | Fixes, heading: HeadingSamples, *, same_clock: bool,
     slipping_ns: tuple[tuple[int, int], ...] = (),
 ) -> Track:  # fmt: skip
-    """Return streams as arrays; `same_clock` as in `Track`; `slipping_ns`, of `RobotLog`, are gaps."""
+    """Return streams as arrays; `same_clock` as in `Track`; the spans `slipping_ns` (`RobotLog`) count as gaps."""
     epoch = int(wheels.stamp_ns[0])
     wheel_t, fix_t, heading_t = (
         (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
@@ -145,7 +145,7 @@ def _thinned(busy: Bools) -> Ints:
 
 
 def fix_std_m(gnss: PositionFixes | Fixes) -> float:
-    """Return the noise of the fixes, an axis [m]: the stated noise, or the measured one where it is clearly larger.
+    """Return the noise of the fixes on one axis [m]: the stated noise, or the measured one where it is clearly larger.
 
     Notes
     -----
@@ -177,7 +177,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
     Parameters
     ----------
     least_m : shortest window; noise of the fixes and held wheel values make windows longer
-    length_m : length of the windows in place of that; 0: not given
+    length_m : length of the windows in place of the computed one; 0: not given
     """
     travel, noise = track.travel, WINDOW_IN_POSITION_STD * min(track.place_std_m, 10.0)
     # distance for which a wheel value is held while the robot moves, with its repetitions
@@ -221,7 +221,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
 
 
 APART_SHARE = 0.9
-"""Quantile of the distances from fix to fix that a window is at least as long as."""
+"""A window is at least as long as this quantile of the distances from fix to fix."""
 
 
 def _apart_m(track: Track) -> float:

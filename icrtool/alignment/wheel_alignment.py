@@ -47,7 +47,7 @@ USUAL_SCALE_STD = 0.04
 the drive the more likely case is taken. In the second case the correction is the posterior mean."""
 
 SMALLEST_SIDE_DIFFERENCE = 0.005
-"""Smallest relative difference of the sides that is corrected. With it the robot veers where both report one speed."""
+"""Smallest relative difference of the sides that is corrected. Where both report one speed, such a robot veers."""
 
 LARGEST_SCALE_CORRECTION = 0.15
 """Largest correction of a scale that tyres and soil explain."""
@@ -66,10 +66,11 @@ FUSED_CORRELATION = 0.9995
 """Correlation of the turn rates of wheels and gyro above which the former may have been computed from the latter."""
 
 FUSED_SLOPE = 0.003
-"""Difference from 1 of the ratio of their turns that the interpolation between stamps may cause."""
+"""Largest difference from 1 of the ratio of wheel turn to gyro turn that interpolation between stamps may cause."""
 
 SHARED_NOISE = 0.9
-"""Correlation of the second differences of both rates, which are mostly noise, of a copied rate."""
+"""Correlation of the second differences of both turn rates above which one rate is a copy of the other. Second
+differences are mostly noise."""
 
 
 def configured_scales(config: Config) -> tuple[float, float]:
@@ -231,7 +232,7 @@ def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
 
 
 def _radius_hint(log: RobotLog, config: Config, scale: float) -> str:
-    """Return what a wrong distance of wheels states of their radius; empty where they need none."""
+    """Return a text on the wheel radius that the log shows; empty where the wheel speeds need no radius."""
     radius_m = config.robot.wheel_radius_m
     by_radius = any(one.role == "wheels" and _ANGLES.search(one.why) for one in log.streams)
     if radius_m is None or not by_radius:
@@ -242,7 +243,7 @@ def _radius_hint(log: RobotLog, config: Config, scale: float) -> str:
 
 
 _ANGLES = re.compile(r" in (rad|counts)")
-"""Words of a stream whose speeds are those of wheels of the configured radius."""
+"""Words in the `why` of a stream whose speeds were computed with the configured wheel radius."""
 
 
 def _find_scales(
@@ -297,8 +298,8 @@ def _find_scales(
 def _fused_note(log: RobotLog, width_m: float | None) -> list[Note]:
     """Return a warning for wheels that are another filter's output: their turn rate is the gyro's.
 
-    A copy of the gyro's rate turns by 1 of it, and has its noise. Wheels that slip by 1 % turn by 1.01 of it.
-    `width_m` is the width that the body twist was converted with.
+    The turn of a copy is 1.00 of the gyro's turn, and a copy has the gyro's noise. The turn of wheels that slip by 1 %
+    is 1.01 of the gyro's turn. `width_m` is the width that the body twist was converted with.
     """
     stream = next((one for one in log.streams if one.is_twist), None)
     if stream is None or log.gyro is None or width_m is None:
@@ -383,8 +384,8 @@ SHORTEST_LONG_S, LONG_WINDOWS = 15.0, 8.0
 """Shortest duration of the long windows [s], and number of long windows in a drive."""
 
 RESOLVED_INTERVALS, MIDDLE_IN_SHORT = 2.0, 2.5
-"""Shortest times over which turns are compared where headings are rare: in intervals between headings, and for the
-middle one in the short one."""
+"""Where headings are rare: the shortest time over which turns are compared, in intervals between headings; and the
+shortest middle time, in short times."""
 
 SMALLEST_CHANGE = 0.1
 """Smallest significant change of the ratio of turn to wheels' turn from short to long windows."""

@@ -42,8 +42,8 @@ ground to another by 0.1; other grounds may differ more. The factor states nothi
 LEAST_START_STD_M = 0.3
 """Standard deviation of each ICR at the start of robots narrower than 0.6 m [m].
 
-A track width configured too small would hold the filter back: with 0.15 m in place of 0.8 m the y ICRs end 0.03 m too
-near to 0 in place of 0.11 m. It costs robots of 0.2 m nothing.
+A track width configured too small would hold the filter back: if 0.15 m is configured for 0.8 m, the y ICRs end 0.03 m
+too near to 0, and without this limit 0.11 m. It costs robots of 0.2 m nothing.
 """
 
 FARTHEST_START_M, LARGEST_START_STD_M = 1000.0, 10_000.0
@@ -51,7 +51,7 @@ FARTHEST_START_M, LARGEST_START_STD_M = 1000.0, 10_000.0
 
 GAP_SPEED_STD_MPS = 2.0
 GAP_TURN_STD_RADPS = 1.0
-"""Standard deviation of the pose's motion in the first second of a gap in the wheel data."""
+"""Standard deviation of the pose's motion [m] and turn [rad] in the first second of a gap in the wheel data."""
 
 WHEEL_GAP_IN_INTERVALS = 2.5
 """Smallest ratio of a gap to the usual interval between wheel samples, for slow streams."""
@@ -193,8 +193,8 @@ a fix would turn the heading."""
 def _without_lost_headings(data: FilterInputs, config: Config, antenna_m: tuple[float, float]) -> FilterInputs:
     """Return the inputs with wheel samples marked that follow a gap in wheels and headings, until the next heading.
 
-    They are not dead-reckoned, as a slip event is not: a pose that moves along a heading that is not known gives the
-    filter a wrong heading with a small standard deviation, by which it then rejects the measured headings.
+    The filter does not dead-reckon through marked samples, as in a slip event. If the pose moved along an unknown
+    heading, the filter would get a wrong heading with a small standard deviation, and reject the measured headings.
     """
     if not config.filter.rules.corrects or len(data.wheel_t) < 2 or not len(data.heading_t):
         return data
@@ -207,7 +207,7 @@ def _without_lost_headings(data: FilterInputs, config: Config, antenna_m: tuple[
         if GAP_TURN_STD_RADPS * math.sqrt(end - seen) <= LOST_RAD or after == len(data.heading_t):
             continue
         until = data.heading_t[after]
-        # a sample is held until the next one: the heading is known in none of these
+        # a sample is held until the next one: the heading is unknown in all of these
         lost[row + 1 : np.searchsorted(data.wheel_t, until)] = True
         of_fixes |= (data.gnss_t > seen) & (data.gnss_t <= until)
     if not (lost.any() or of_fixes.any()):

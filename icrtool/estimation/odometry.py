@@ -98,7 +98,7 @@ def drive_wheels(table: States, in_gap: Bools, icrs: FrozenIcrs, every: int = 1)
 
 
 def _pieces(table: States, in_gap: Bools, icrs: FrozenIcrs) -> Iterator[tuple[slice, OpenLoopPath]]:
-    """Yield the path of `drive_wheels` in order, some states at a time: paths are as long as columns of the run."""
+    """Yield the path of `drive_wheels` in order, some states at a time: a whole path is as long as a column."""
     track = track_of_states(table, in_gap, np.empty((0, 2), np.int64))
     edges = np.flatnonzero(in_gap[:-1])
     miss_north, miss_east, turned = 0.0, 0.0, 0.0
@@ -152,7 +152,7 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
 
     Parameters
     ----------
-    jumps : of the reference; what it jumps is not driven
+    jumps : of the reference; their length does not count as driven
 
     Notes
     -----

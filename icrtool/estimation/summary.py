@@ -92,7 +92,7 @@ def summarise(
     rules = config.filter.rules
     scale = measurements.findings["wheel_scale"] if rules.corrects else None
     of_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
-    # while the robot was in use
+    # of measurements while the wheels turn
     of_fixes, of_headings = sensors.moving()
     rejected = {
         "fixes": rejected_share(filtered.gnss.code[of_fixes]),

@@ -60,7 +60,7 @@ _RETURNED = (0, -2)
 """What machine code returns where it raised no exception: it has a result, or None."""
 
 _watchers: list[Callable[[], None]] = []
-"""Called when numba begins to compile a kernel, which is once a computer."""
+"""Called when numba begins to compile a kernel, which happens once on a computer."""
 
 _parts: list[Callable[..., Any]] = []
 _lock = threading.RLock()
@@ -118,7 +118,7 @@ _ELF_SECTIONS = struct.Struct("<40xQ10xHHH")
 
 
 def _is_object(content: bytes) -> bool:
-    """Return whether bytes are an object file up to its end: LLVM crashes on a part of one."""
+    """Return whether bytes are an object file, of ELF a complete one: LLVM crashes on an incomplete file."""
     if not content.startswith(_OBJECT_MAGICS) or len(content) < _ELF_SECTIONS.size:
         return False
     if not content.startswith(_OBJECT_MAGICS[0]):
@@ -159,7 +159,7 @@ class MachineCode(NamedTuple):
         return None
 
     def function(self, forms: Sequence[Any]) -> Callable[[Sequence[object]], Result]:
-        """Return what runs it, given the words of its arguments, which have these C types."""
+        """Return a function that runs the code on the words of its arguments, which have these C types."""
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
         engine.add_object_file(llvm.ObjectFileRef.from_data(self.content))
         engine.finalize_object()
@@ -215,7 +215,7 @@ class Kernel:
     def _function(
         self, types: tuple[object, ...], values: Sequence[object], arguments: _Arguments
     ) -> Callable[[Sequence[object]], Result] | None:
-        """Return what runs the machine code that is kept, or is made now; None where numba alone can run it."""
+        """Return a function that runs the machine code, kept or made now; None where numba alone can run it."""
         name = f"{self.py_func.__module__.rpartition('.')[2]}.{self.py_func.__qualname__}"
         file = f"{name}-{hashlib.sha256(repr((_stamp(), types)).encode()).hexdigest()[:24]}.o"
         for place in cache_places() if _stamp() else ():
@@ -234,7 +234,7 @@ class Kernel:
 
 
 def _loaded(code: MachineCode | None, forms: Sequence[Any]) -> Callable[[Sequence[object]], Result] | None:
-    """Return what runs machine code; None where there is none, or llvmlite of this version cannot load it."""
+    """Return a function that runs machine code; None where there is none, or this llvmlite cannot load it."""
     try:
         return code and code.function(forms)
     except Exception:  # noqa: BLE001 - whatever the reason, numba runs the kernel
@@ -336,8 +336,8 @@ def _gives_the_same(function: Callable[..., Any], *given: object) -> bool:
 def _plain_njit(function: Callable[..., Any]) -> Callable[..., Result]:
     """Return a function as ``numba.njit(cache=True)`` makes it; without the cache where no place can be written.
 
-    Numba looks only at the file of the function to see whether it has changed. Therefore its folder is named by all
-    kernels.
+    Numba looks only at the file of the function to see whether it has changed. Therefore the name of the folder depends
+    on the sources of all kernels.
     """
     numba, place, stamp = _numba(), writable_place(), _stamp()
     _mark_parts()
@@ -405,7 +405,7 @@ def _mark(part: Callable[..., Any], options: Mapping[str, object]) -> None:
 
 
 def _machine(level: int = 0) -> llvm.TargetMachine:
-    """Return what makes machine code for this processor, with a level of optimisation."""
+    """Return the compiler's target: this processor, with a level of optimisation."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = processor()
@@ -426,7 +426,9 @@ def processor() -> tuple[str, str]:
 
 @functools.cache
 def _stamp() -> tuple[str, ...]:
-    """Return what machine code depends on: all kernels, as one holds what it calls, compiler, target and processor.
+    """Return what machine code depends on: the sources of all kernels, compiler, target and processor.
+
+    All kernels, because the machine code of a kernel holds the kernels that it calls.
 
     Empty where nothing is to be kept: the kernels' sources cannot be read, or numba compiles for a debugger.
     """

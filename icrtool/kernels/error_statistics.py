@@ -2,7 +2,7 @@
 
 Errors are float64 (n_starts, n_horizons) [m] with NaN where there was no trial, as `icrtool.kernels.open_loop` makes
 them. Trials from neighbouring starts share most of their path and are not independent: intervals come from blocks of
-path, not from trials. No kernel is here.
+path, not from trials. This module has no compiled kernel.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def student_factor(freedom: float, z: float = NORMAL_FACTOR) -> float:
 
 
 def pooled_variance(measured: float, freedom: float, known: float) -> tuple[float, float]:
-    """Return a variance and its degrees of freedom, of a measured one and of one that is known of other drives.
+    """Return the pooled variance of a measured one and of one known of other drives, and its degrees of freedom.
 
     Notes
     -----
@@ -235,7 +235,7 @@ def error_intervals(
 
     Parameters
     ----------
-    errors_m, blocks : as of `block_sums`, which gave `sums`
+    errors_m, blocks : as given to `block_sums`, which returned `sums`
     p50_m, p95_m : of all trials
     spread : what is known of other drives
 
@@ -247,8 +247,9 @@ def error_intervals(
     -----
     Normal logarithms, Student's t (1908). The variance of a drive is the variance that its blocks show, pooled with the
     variance of drives of its length (`pooled_variance`), because few blocks alone would give intervals of any width.
-    p95 changes as the root mean square does, which blocks show better than the few trials above p95. p95 is smaller on
-    short paths than on long ones: its logarithm by about its variance, and the upper end is raised by that variance.
+    p95 changes as the root mean square does, which blocks show better than the few trials above p95. On short paths
+    p95 is smaller than on long ones, its logarithm by about the variance of the logarithm. The upper end is raised by
+    this variance.
     The interval of this drive's p95 does not go below its median, nor above the interval of the next drive.
 
     The next drive, of the same length, adds the variance of its own finite path and the variance between drives.
@@ -343,7 +344,7 @@ PERCENTILE_CELLS = 1024
 
 
 def count_cells(errors_m: Floats, width_m: float) -> tuple[NDArray[np.int16], Ints]:
-    """Return the cell of each error (m,), of this width from zero on, and how many are in each up to the largest."""
+    """Return the cell of each error (m,) [m], for cells of this width from zero on, and the number in each cell."""
     cell = np.empty(len(errors_m), np.int16)
     counts = np.zeros(int(errors_m.max() / width_m) + 1 if len(errors_m) else 0, np.int64)
     for lo in range(0, len(errors_m), ROWS_AT_ONCE):

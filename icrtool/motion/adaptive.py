@@ -59,11 +59,12 @@ LARGEST_DELAY_S = 0.4
 """Largest delay between wheels and poses [s], four standard deviations of its prior."""
 
 FEWEST_FOR_WANDER = 60
-"""Number of windows from which on the wander of the heading is estimated. Fewer windows show the prior's error."""
+"""Number of windows from which on the wander of the heading is estimated. From fewer windows it would be the error of
+the prior."""
 
 USUAL_STD = (0.02, 0.02)
-"""Spread of residuals before a drive, of displacements [m^0.5] and of turns [rad/m^0.5]. With 0.03 the expected error
-after 10 m is 3 % larger on 18 simulated robots of which nothing is known."""
+"""Spread of residuals that is assumed before a drive, of displacements [m^0.5] and of turns [rad/m^0.5]. With 0.03 the
+expected error after 10 m is 3 % larger on 18 simulated robots of which nothing is known."""
 
 USUAL_COUNTS_AS = 4.0
 """Number of independent windows that `USUAL_STD` counts as. The first few windows are always fitted almost exactly, so
@@ -212,7 +213,7 @@ class Estimate:
 
 
 def _scale_of(residuals: Floats, kind: Ints) -> Floats:
-    """Return the robust standard deviation (2,) of the residuals of each kind, with the usual one."""
+    """Return the robust standard deviation (2,) of the residuals of each kind, pooled with `USUAL_STD`."""
     count = len(kind) / len(RESIDUAL_KINDS) / WINDOWS_AS_ONE
     found = scale_by_kind(residuals, kind)[[0, -1]]
     together = (count * found**2 + USUAL_COUNTS_AS * np.square(USUAL_STD)) / (count + USUAL_COUNTS_AS)

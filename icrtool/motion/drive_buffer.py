@@ -56,7 +56,7 @@ class DriveBuffer:
     ----------
     size : part of the usual distances that is used (`icrtool.motion.recording.size_of`)
     every_m : distance between knots [m]
-    count : number of the knots, with the forgotten ones
+    count : number of the knots, the forgotten ones included
     """
 
     def __init__(self, size: float) -> None:

@@ -25,8 +25,8 @@ METRICS = {
 next drive."""
 
 DISTANCES = {"within": "p95_m", "within_next": "p95_next_high_m"}
-"""Names of errors in files, by the names of distances in acceptance limits: over the distance, the error stays within a
-budget."""
+"""Names of errors in files, by the names of distances in acceptance limits. Such a distance is the longest one over
+which the error stays within a budget."""
 
 
 NEAR_HORIZONS_M = 1.5
@@ -40,7 +40,7 @@ class BudgetDistance(Record, frozen=True):
     ----------
     distance_m : interpolated between horizons, from 0 m at 0 m
     beyond : `distance_m` is a lower bound: the error is within the budget at the last horizon with trials
-    between_m : horizons interpolated between
+    between_m : the two horizons between which `distance_m` was interpolated
     without_events_m, beyond_without_events : distance_m and beyond of trials that touch no slip event; None without an
         event
     low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; None where
@@ -139,7 +139,8 @@ class Verdict(Gate, frozen=True, kw_only=True):
     baseline_m : the baseline's number
     margin_m : negative where the number exceeds the bound; margin_low_m, margin_high_m : its 95 % confidence interval,
         of a limit relative to the baseline
-    passed : of a limit relative to the baseline also where the interval of the difference reaches the bound
+    passed : the limit is met; a limit relative to the baseline is also met where the interval of the difference reaches
+        the bound
     value_bound_m : the bound, with the baseline's share
     not_checked : why the limit was not checked; None where it was
     unusable : why the run must not be used, which fails every limit; None where it can be

@@ -38,7 +38,7 @@ class CalibratedRobot(Record, frozen=True, kw_only=True):
 
 
 class PooledScore(Record, frozen=True):
-    """Errors of one model at one horizon, of the held-out trials of all logs, or blocks of one, together."""
+    """Errors of one model at one horizon, over all held-out trials together: of all logs, or of the blocks of one."""
 
     model: str
     horizon_m: float
@@ -60,7 +60,9 @@ class MeasuredConstant(Record, frozen=True):
 
 
 class SensorConstants(Record, frozen=True, kw_only=True):
-    """What relates the sensors of a log as they were sent, in addition to a motion model; None: not known.
+    """Constants of the sensors of a log, with respect to the streams as they were sent; None: not known.
+
+    They are needed in addition to a motion model.
 
     Attributes
     ----------
@@ -92,13 +94,13 @@ class LogSensors(Record, frozen=True):
 
 
 class HeldSensors(Record, frozen=True):
-    """Constants of the sensors that a calibration's row holds in a log.
+    """Constants of the sensors that the row of a calibration holds for the log that is tested.
 
     Attributes
     ----------
     held : what the logs of the calibration give for a further drive, with its standard deviation; None: not known
-    measured : the constants of this log for the same parameters; None where the drive is too short
-    refitted : the row has the constants of this log in place of those held
+    measured : the constants that this log shows with the same parameters; None where the drive is too short
+    refitted : the row has the constants of this log in place of the held ones
     """
 
     held: SensorConstants
@@ -341,9 +343,10 @@ class ErrorsAt(Record, frozen=True):
 
 
 class TransferCost(ErrorsAt, frozen=True, kw_only=True):
-    """Cost of one group's calibration in another's runs: its errors minus the errors of the tested group's own.
+    """Cost of one group's calibration in the runs of another group.
 
-    Both in the same trials; the own calibration is held out.
+    Errors of this calibration minus the errors of the tested group's own calibration, in the same trials; the own
+    calibration is held out.
     """
 
     calibrated_on: str
@@ -401,7 +404,7 @@ class GroupComparison(Record, frozen=True, kw_only=True):
     ----------
     pairs : the first group with each of the others
     transfer : the transfer matrix, by row, column and horizon
-    costs : of its cells off the diagonal
+    costs : of the cells of the matrix off the diagonal
     """
 
     schema: Literal["icrtool/compare/1"]

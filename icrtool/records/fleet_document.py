@@ -88,14 +88,15 @@ class FleetLog(Record, frozen=True):
     run : directory of the run, below the directory of the batch
     status : of the result
     this_time : ``skipped``: the result is from an earlier batch with the same input, configuration and version
-    reason : why it failed, its ICRs are not usable, or that the log is truncated; `usable` : whether they are
+    reason : why it failed, why its ICRs are not usable, or that the log is truncated
+    usable : whether its ICRs are usable
     details : last lines of the process that failed
     repeatable : whether the same input, configuration and version give this result again
     icr : final ICRs [m] and, as ``std_…``, their standard deviations
     multiplier : (y_r - y_l)/b, wheel separation multiplier of a differential-drive controller, with `multiplier_std`
     errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``
     bounds : the names in `errors` whose distance is a lower bound
-    outages, warnings : how many
+    outages, warnings : number of each
     notes : findings of the run, the grave ones among them
     baseline : numbers of the log's report in the baseline, by the names of `errors`
     changes : how log, configuration and version differ from the baseline

@@ -57,9 +57,9 @@ class Row:
     words : what predicts the motion, in a few words
     knows : what its numbers were learned from
     color, dash, width : its line, in pictures and on pages; most lines have width 1
-    shown : stands in the first table and is drawn on a page from the start; the others are a click or ``-v`` away
-    pictured : drawn in pictures, and its path is made for single trials
-    in_csv : has a column where a table has one column a row: worst.csv, the page of a batch
+    shown : stands in the first table and is drawn on a page from the start; the others need a click or ``-v``
+    pictured : drawn in pictures, and its path is computed for single trials
+    in_csv : has a column in tables with one column for each row of the report: worst.csv, the page of a batch
     on_robot : a user can run it on a robot; the others analyse a log
     compared : stands for comparison: a thin line without interval, drawn with every other row in pictures of paths
     turned_shown : `shown` of the row with a gyro or heading

@@ -64,7 +64,7 @@ class WheelSamples(Samples):
     unit : ``mps``: speeds that are ready to use; else as the log sends them, in this unit per second, without the
         configured scales, until `icrtool.alignment.wheel_units` has made speeds of them
     from_position : the log sends positions; these are their mean speeds to the next sample
-    restarts_ns : stamps of the samples after which the positions began again, in a gap of which nothing is known
+    restarts_ns : stamps of the samples after which the positions began again; the motion in this gap is not known
     """
 
     stamp_ns: Ints
@@ -191,7 +191,7 @@ TWIST_TYPES = frozenset(
 )
 """Message types that hold a body twist, measured or commanded. Wheel speeds are computed from it with a width.
 
-Its turn rate is the difference of the sides over the width that the controller uses.
+The turn rate of a twist is the difference of the sides' speeds divided by the width that the controller uses.
 """
 
 
@@ -249,7 +249,7 @@ def rate_and_jitter(stamps: Ints) -> tuple[float | None, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class HeadingSensor:
-    """The topic that states a heading; `convention`: the one that its yaw was read with."""
+    """The topic that states a heading; `convention`: how its yaw was read."""
 
     topic: str
     message_type: str

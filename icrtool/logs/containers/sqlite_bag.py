@@ -31,7 +31,7 @@ from icrtool.records.text import LogText
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 _WAL_AT = 18
-"""Place in the header of a database of the byte that states whether it uses a write-ahead log."""
+"""Offset, from the start of a database, of the byte that states whether it uses a write-ahead log."""
 
 _IN_WAL_MODE = b"\2"
 """Value of this byte where the database uses a write-ahead log."""
@@ -111,7 +111,7 @@ class SqliteBag(Container):
             raise LogError(path, "not a readable rosbag2 database", found) from err
 
     def _lacking_log(self) -> str:
-        """Return in words that the write-ahead log of a database is missing; empty where it has none, or has it."""
+        """Return in words that the write-ahead log of a database is missing; empty if it is there, or none is used."""
         log = self._file.with_name(f"{self._file.name}-wal")
         with self._file.open("rb") as file:
             is_ahead = file.read(_WAL_AT + 1)[_WAL_AT:] == _IN_WAL_MODE
@@ -259,7 +259,7 @@ class SqliteBag(Container):
         Notes
         -----
         SQLite joins the messages of a batch itself, without one Python object for each and without the interpreter
-        lock. Rows that hold no message, which the first query finds, are left out by the second.
+        lock. If the first query finds rows without a message, the second query reads the batch without these rows.
         """
         # The ids are integers from the database itself; as parameters they could exceed SQLite's limit of variables.
         within, whole = (f"topic_id IN ({','.join(map(str, sorted(some)))})" for some in (wanted, cut.whole))
@@ -295,7 +295,7 @@ class SqliteBag(Container):
                 if count == 1:
                     self.report("log_damaged", f"damaged ({err}); the rows before the damage were read; {self._advice}")
                     return
-                count //= 2  # read the rows before the damage; or the rows are too long together
+                count //= 2  # to read the rows before the damage, or fewer of very long rows
                 continue
             if last is None:
                 return

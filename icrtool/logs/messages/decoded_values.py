@@ -176,7 +176,7 @@ def _text(value: object) -> bytes:
 
 
 def _padded(rows: Sequence[Sequence[Any]], lacking: float, result: type[np.float64 | np.int64]) -> NDArray[Any]:
-    """Return rows of different lengths (n, longest)."""
+    """Return rows of different lengths as one array (n, longest), filled up with `lacking`."""
     padded = np.full((len(rows), max(map(len, rows), default=0)), lacking, result)
     for row, values in zip(padded, rows, strict=True):
         row[: len(values)] = values
@@ -224,7 +224,7 @@ class SentenceDecoder:
         self.kinds = {path: kind for path, kind in self.inner.kinds.items() if path != "sentence"} | _KINDS_OF_NMEA
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> DecodedValues:
-        """Decode the first of messages [start, end) (n,) of `data`.
+        """Decode messages [start, end) (n,) of `data`: the first ones, up to the limit of `inner`.
 
         A message with a wrong checksum is unreadable. A message without checksum is unreadable, unless no sentence of
         the topic has one.
@@ -343,7 +343,7 @@ def _number(text: str) -> float:
 
 
 _MINUTES = 60.0
-"""Minutes of a degree; a receiver that rounds may write 60."""
+"""Largest number of minutes; a receiver that rounds may write 60."""
 
 
 def _degrees(text: str, side: str, sides: str) -> float:
@@ -376,7 +376,7 @@ _MOST_NESTED = 3
 
 
 def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
-    """Return the decoder of Protobuf or JSON; without fields in a JSON schema, the messages show them."""
+    """Return the decoder of Protobuf or JSON; if a JSON schema lists no fields, all wanted ones are looked for."""
     paths, kinds = _columns_of(replace(channel, id=0, topic=LogText(""), count=None), wanted)
     if channel.encoding == "json":
         return ValueDecoder(kinds, paths, parse_json_message, property_of)
@@ -467,7 +467,7 @@ def _add(definitions: dict[str, tuple[Any, Any]], name: str, schema: object, dep
 
 
 def _kind(described: object) -> str:
-    """Return the type that a schema states; empty where it states none, as of an enumeration, which is a number."""
+    """Return the type that a schema states; empty where it states none, as for an enumeration, read as a number."""
     if not isinstance(described, dict):
         return ""
     kind = described.get("type", "object" if "properties" in described else None)

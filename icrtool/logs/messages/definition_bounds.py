@@ -73,18 +73,18 @@ class FieldNames:
         raise DefinitionError(self.message_type, why, "this type is not read")
 
     def add_text(self, text: str) -> None:
-        """Refuse a definition with a word that is too long for a name, but in comments and strings.
+        """Refuse a definition with a word that is too long for a name, outside comments and strings.
 
         Raises
         ------
         DefinitionError
-            There is one.
+            There is such a word.
         """
         if (word := _LONG_WORD.search(COMMENT_OR_STRING.sub(" ", text))) is not None:
             self.add(word[0])
 
     def add_modules(self, idl: str) -> None:
-        """Count the full name of each place within modules of IDL: the parser puts all of it before each type.
+        """Count the full name of each module of IDL: the parser puts it before the name of each type in the module.
 
         Raises
         ------
@@ -102,7 +102,7 @@ class FieldNames:
 
 @dataclass(slots=True)
 class DefinitionBudget:
-    """The limit of what is parsed of the definitions in a log: each topic may have another definition.
+    """The limit of the definitions that are parsed for one log: each topic may have another definition.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class DefinitionBudget:
         self._parsed.add(one)
 
     def _cost_of(self, channel: Channel) -> int:
-        """Return what it costs to parse a definition; beyond what is left, the first part that shows it."""
+        """Return the cost of parsing a definition; where a part of the cost exceeds what is left, this part."""
         text = channel.definition
         if channel.encoding in ("json", "protobuf"):
             return len(text) // _SCHEMA_SHARE + _LEAST_COST

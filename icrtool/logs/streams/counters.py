@@ -59,7 +59,14 @@ class Modulus(NamedTuple):
 
 
 class _Wraps(NamedTuple):
-    """Large steps of a column: the modulus that each one shows (w,), its uncertainty (w,), the range of the column."""
+    """Large steps of a column.
+
+    Attributes
+    ----------
+    moduli, spread : (w,) the modulus that each step shows, and its uncertainty
+    extent : range of the column
+    between : sum over pairs of successive large steps of the travel between them, as a share of the range, at most 1
+    """
 
     moduli: Floats
     spread: Floats
@@ -70,13 +77,13 @@ class _Wraps(NamedTuple):
 def find_modulus(columns: Iterable[NDArray[Any]], given: float | None = None) -> Modulus | None:
     """Return the modulus at which all of some counters, or angles, begin again; None where none shows.
 
-    At a passage of the modulus a column steps by nearly all of its range, and the step that is left is like its
-    neighbours; between two passages the column runs through its range.
+    At a passage of the modulus a column steps by nearly all of its range, and the step minus the modulus is like the
+    steps next to it; between two passages the column runs through its range.
 
     Parameters
     ----------
     columns : (n,) each, of the wheels of one robot; whole numbers, or numbers that may be angles
-    given : the encoder counts of a turn, which are tried first
+    given : the encoder counts of a turn, which are tried before powers of two
     """
     arrays = [np.asarray(column) for column in columns]
     found = [wraps for column in arrays if (wraps := _wraps_of(column.astype(np.float64))) is not None]

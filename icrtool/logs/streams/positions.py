@@ -27,7 +27,7 @@ class Solution(NamedTuple):
     ----------
     codes, otherwise : the class by number, and the class of all other numbers
     mask : the bits of the number that count
-    informative : the topic states no class unless some fix is one with carrier phase: drivers write 0 for every fix
+    informative : the numbers count only if some fix has carrier phase, because drivers may write 0 for every fix
     """
 
     name: str
@@ -73,7 +73,7 @@ GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.I
 GOAL = "its name is the name of a goal, not of a measurement"
 
 LEAST_AREA_M = 1.0
-"""Least width of a drive that shows its plane [m], a standard deviation."""
+"""Least width of a drive that shows in which plane it lies: a standard deviation of its positions [m]."""
 
 FLAT_RATIO = 0.1
 """Largest ratio of thickness to width of the plane of a drive."""
@@ -148,7 +148,9 @@ class Fix:
         return fields_in(numbers, (*self.valid, *self.stated, *self.independent))
 
     def read(self, table: TopicTable, config: Config) -> PositionSource:
-        """Return its positions; usable: finite, with a fix, and if geodetic on earth, not at 0, 0, near the others.
+        """Return its positions; usable ones are finite and have a fix.
+
+        Usable geodetic positions also lie on earth, not at 0, 0, and near the others.
 
         Metric positions of goals, of dead reckoning and of frames whose z is not up are refused.
         """
@@ -244,11 +246,11 @@ class Fix:
 
 
 def _far_away(latitude_deg: Floats, longitude_deg: Floats, known: Bools) -> Bools:
-    """Return the known fixes (n,) of another place: a receiver that was switched on may send its last place."""
+    """Return which known fixes (n,) lie far from the others: a receiver may send its last place when switched on."""
     far, latitude_deg, longitude_deg = np.zeros(len(known), np.bool_), latitude_deg[known], longitude_deg[known]
     if len(latitude_deg):
         middle_deg = float(np.median(latitude_deg))
-        east_deg = np.mod(longitude_deg - longitude_deg[0] + 180.0, 360.0) - 180.0  # not across the date line
+        east_deg = np.mod(longitude_deg - longitude_deg[0] + 180.0, 360.0) - 180.0  # no step at the date line
         east_deg = (east_deg - np.median(east_deg)) * math.cos(math.radians(middle_deg))
         away_deg = np.maximum(np.abs(latitude_deg - middle_deg), np.abs(east_deg))
         far[known] = away_deg * METRES_PER_DEGREE > FARTHEST_M
@@ -265,7 +267,7 @@ def _is_level(places_m: Floats) -> bool:
     some = places_m[:: max(1, len(places_m) // MOST_PLACES)]
     if len(some) < 3 or not (np.abs(some) < LARGEST_PLACE_M).all():
         return True
-    # single jumps are no place
+    # single jumps do not widen the drive
     kept = np.clip(some, *np.percentile(some, [2.5, 97.5], axis=0))
     _, size, axes = np.linalg.svd(kept - kept.mean(axis=0), full_matrices=False)
     _, across_m, off_m = size / math.sqrt(len(some))
@@ -332,7 +334,7 @@ def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[flo
 
 
 def _in_roots(transforms: Transforms) -> Transforms:
-    """Return each frame's root, and its origin and axes in it; a frame in a circle of frames is its own root."""
+    """Return each frame's root, and the frame's origin and axes in this root; a frame in a circle is its own root."""
     placed: Transforms = {}
     for name in transforms:
         chain: dict[str, None] = {}
@@ -366,8 +368,8 @@ class _Link(NamedTuple):
 def transform_pose(table: TopicTable) -> TopicTable:
     """Return the poses of the robot's base in the root of the transforms, as messages of PoseStamped.
 
-    Where the base is an odometry's and the root moves against it, as a map does after each matched scan, there is a
-    pose at the first odometry after each such step: later poses add only the odometry's motion.
+    Where an odometry frame lies between base and root, the root moves against it in steps, as a map does after each
+    matched scan. There is one pose, at the first odometry after each step: later poses add only the odometry's motion.
 
     Raises
     ------

@@ -65,13 +65,13 @@ MOST_SEARCHED = 1 << 17
 types."""
 
 MOST_PATHS = 1 << 20
-"""Largest number of characters of the paths of these fields."""
+"""Largest number of characters of the paths of the fields that are found."""
 
 MOST_PAIRS = 256
 """Largest number of pairs of sides of a log that are tried."""
 
 _HOLD_NS = 500_000_000
-"""Longest time for which the last value of a side that ends before the other is held [s]."""
+"""Longest time for which the last value of the side that ends first is held [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class Side:
         return LogText(_name(LogText(self.table.topic).raw, self.path))
 
     def columns(self) -> list[NDArray[Any]]:
-        """Return its numbers (n,) as recorded, of each element that is meant.
+        """Return its numbers (n,) as recorded, of each element that the path names.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class Side:
 
 
 class PairNumbers(NamedTuple):
-    """The numbers of both sides (n,), counters continued, and the modulus at which they begin again, where it shows."""
+    """The numbers of both sides (n,), counters continued, and the modulus at which they begin again, if found."""
 
     left: NDArray[Any]
     right: NDArray[Any]
@@ -363,7 +363,7 @@ def twist_motion(speed: Side, turn: Side, config: Config) -> WheelSource:
 
 
 def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, Ints, Ints]:
-    """Return the stamps of the left side, and the times of both sides: of headers where both have them, else logged."""
+    """Return the stamps of the left side, and the times of both sides: of headers if both have them, else logged."""
     rows = stamp_rows(left), stamp_rows(right)
     headers = [one.header_ns for one in rows if one.header_ns is not None and (np.diff(one.header_ns) >= 0).all()]
     clock_set = max(one.clock_set for one in rows)
@@ -382,7 +382,7 @@ def _half_interval(times: Ints) -> int:
 
 
 def _unwrapped(values: NDArray[Any], modulus: Modulus | None) -> NDArray[Any]:
-    """Return a counter (n,) continued past its modulus; None: the smaller of 16 and 32 bits that holds it."""
+    """Return a counter (n,) continued past its modulus; None: past the smaller of 16 and 32 bits that holds it."""
     if not len(values) or (modulus is None and values.dtype.kind == "f"):
         return values
     size = modulus.value if modulus is not None else register_size(values)

@@ -45,7 +45,7 @@ def of_wheels(
     Parameters
     ----------
     wheels : returns the positions, or the speeds, (n,) of each wheel, the left ones first; none where not recorded
-    lefts : how many are left
+    lefts : number of wheels of the left side
     names : of the wheels
     others : what else `motion_of` takes
     """
@@ -55,7 +55,7 @@ def of_wheels(
     for quantity in means:
         columns = wheels(quantity)
         if columns:
-            # before the mean of a side: a front and a rear wheel do not begin a turn at the same time
+            # unwound before the mean of a side: a front and a rear wheel do not complete a turn at the same time
             turns_modulo = quantity == "position" and unit == "rad"
             means[quantity], stuck = _side_means([*map(unwound_turns, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
@@ -117,7 +117,7 @@ class FixedWheels:
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is
     position, speed : fields of the left and of the right side; for several places in a list, their mean
-    unit : unit of the positions, and per second of the speeds; factor : from recorded numbers to the unit
+    unit : unit of the positions, and per second of the speeds; factor : converts recorded numbers to it
     """
 
     what: str
@@ -170,7 +170,7 @@ def read_ticks(table: TopicTable, _: Config) -> WheelSource:
     """Return the motion in xbot_msgs/WheelTick: counters that only count up, and the direction of each wheel.
 
     A step has the direction that is stated after it, as in OpenMower's own xbot_positioning. Its driver leaves
-    `valid_wheels` at 0, and the rear wheels are meant.
+    `valid_wheels` at 0; then the rear wheels are used.
     """
     valid = table.integers("valid_wheels")
     bits = int(np.bitwise_or.reduce(valid)) if valid is not None else 0
@@ -279,7 +279,7 @@ POSE_PENALTY = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Odometry(Twist):
-    """A message type with the velocity of the body and its pose by the wheels; the pose counts if the velocity is 0."""
+    """A message type with the velocity of the body, and with a pose by the wheels that is used if the velocity is 0."""
 
     @property
     def fields(self) -> tuple[str, ...]:
