@@ -1,11 +1,11 @@
-"""The motion models on recordings, or distance of one, that they were not fitted to.
+"""Errors of the motion models on recordings, or parts of one recording, that the models were not fitted to.
 
-Of many recordings each is left out in turn (Stone 1974). In a single one each trial is predicted without the windows
-that share distance with it (Burman, Chow and Nolan 1994). On recorded drives a further distance of 5 or 10 m between
-trial and windows changed no error.
+Of several recordings each is left out in turn (Stone 1974). In a single recording each trial is predicted by a fit
+without the windows that share distance with the trial (Burman, Chow and Nolan 1994). On recorded drives a further
+distance of 5 or 10 m between trial and windows changed no error.
 
 Held-out windows of several lengths also show how the errors of a model grow (`icrtool.calibration.error_growth`). The
-quantiles are scaled to hold in these windows. The errors of the controller's model are measured there, too.
+quantiles are scaled so that they hold in these windows. The errors of the controller's model are measured there, too.
 """
 
 from __future__ import annotations
@@ -86,11 +86,11 @@ FEWEST_TESTED = 10
 
 @dataclass(frozen=True, slots=True)
 class HeldOutRow:
-    """One model on what it was not fitted to.
+    """Errors of one model in trials that it was not fitted to.
 
     Attributes
     ----------
-    folds : errors of each fold, by horizon; together : of all trials
+    folds : errors of each fold, by horizon; together : errors of all trials
     """
 
     name: str
@@ -115,9 +115,9 @@ class HeldOut:
 
     Attributes
     ----------
-    folds : recordings or, of a single one, blocks of distance
-    trials : by recording
-    fits : of everything, by model name
+    folds : the recordings; of a single recording, blocks of distance
+    trials : trials of each recording
+    fits : fits to all recordings together, by model name
     """
 
     recordings: tuple[Recording, ...]
@@ -128,7 +128,7 @@ class HeldOut:
 
     @cached_property
     def scores(self) -> tuple[HeldOutRow, ...]:
-        """Errors in the trials of all recordings, a row a model."""
+        """Errors in the trials of all recordings, one row per model."""
         fold_of = []
         for i, (trials, recording) in enumerate(zip(self.trials, self.recordings, strict=True)):
             mine = [fold for fold in self.folds if fold.recording == i]
@@ -168,7 +168,7 @@ class HeldOut:
         return next(score for score in self.scores if score.name == name)
 
     def without(self, name: str, fold: Fold) -> Prediction | None:
-        """Return what a row predicts without a fold; None where too little is left to fit it."""
+        """Return the model and constants of a row, fitted without a fold; None where too little is left to fit it."""
         if name == NO_SLIP:
             return self.fits[NO_SLIP].fitted, NO_CONSTANTS
         base = name.removesuffix(GYRO_SUFFIX)
@@ -195,7 +195,7 @@ class HeldOut:
 
 
 def path_between(recording: Recording, found: Prediction, steps: Track, start: int, end: int) -> OpenLoopPath:
-    """Return the path that a model predicts from one state of a recording to another; `steps`: its samples joined."""
+    """Return the path that a model predicts between two states of a recording; `steps`: its wheel samples, joined."""
     track, rows = recording.track, np.arange(start, end + 1)
     near = steps.around(track.t[start], track.t[end])
     turned, place = predicted_path(recording, *found, near)(track.t[rows])
@@ -205,7 +205,7 @@ def path_between(recording: Recording, found: Prediction, steps: Track, start: i
 
 
 def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
-    """Return what is left out in turn: each recording, or of a single one contiguous blocks of distance.
+    """Return the folds to leave out in turn: each recording, or contiguous blocks of distance of a single recording.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
 
 
 def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floats) -> Iterator[tuple[Fold, Ints]]:
-    """Yield each fold that trials of a recording need left out, and the rows of these trials.
+    """Yield each fold that must be left out to predict trials of a recording, and the rows of these trials.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def errors_without(
     Parameters
     ----------
     without : gives the model for a fold, None where too little is left to fit it
-    steps : the wheel samples joined; default single samples
+    steps : the wheel samples, joined; default: single samples
     """
     track, distance = recording.track, recording.track.distance
     errors = TrialErrors.none(trials.ends.shape)
@@ -344,8 +344,8 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     -----
     The variances are non-negative least squares of the squared errors; each length and direction has the same weight.
     The factors come from split conformal prediction (Vovk et al. 2005), where windows of 10 m count as independent.
-    Their logarithm is shrunk towards zero (James and Stein 1961), because a short drive shows its largest error and no
-    quantile.
+    Their logarithm is shrunk towards zero (James and Stein 1961), because a short drive shows only its largest error,
+    not a quantile.
     """
     found: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
     tested = [np.empty((0, 3))]
@@ -418,7 +418,7 @@ def _variances(errors: Floats) -> tuple[float, float, float]:
 
 
 def _variance_stds(errors: Floats, stretches: int) -> tuple[float, float, float]:
-    """Return the standard deviations of `_variances` (3,), of errors of overlapping windows on separate stretches."""
+    """Return the standard deviations of `_variances` (3,); windows overlap, so only separate stretches are counted."""
     along, across, heading = ((errors**2).std(axis=0) / math.sqrt(max(stretches, 1))).tolist()
     return along, across, heading
 

@@ -1,4 +1,4 @@
-"""Runs as recordings, which motion models are fitted to and tested on, and the calibrations of several pooled."""
+"""Runs as recordings, to which motion models are fitted, and calibrations from one recording or several."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _corrected(run: Run) -> LogConstants:
 
 
 def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
-    """Return the antenna's position where it is configured, or in the log's transforms, forward and right [m]."""
+    """Return the antenna's position forward and right [m]; None where neither configuration nor log states it."""
     used, given = run.sensors.facts.antenna_m, run.config.frames
     in_log = run.sensors.facts.antenna_is_known and given.antenna_right_m == "auto"
     return (
@@ -100,7 +100,7 @@ def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
 
 
 def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | Literal["auto"] = "auto") -> Recording:
-    """Return a recording with the turn rate of a measured heading; unchanged if that heading does not turn with it.
+    """Return a recording with the turn rate of a measured heading; unchanged if the two do not turn together.
 
     Parameters
     ----------
@@ -129,19 +129,19 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | 
 
 
 def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
-    """Return a run as `recording_of`, with its measured heading of a kind (``gyro``, ``heading``) where it has one."""
+    """Return `recording_of` a run with its measured heading of one kind (``gyro`` or ``heading``), if it has one."""
     return recording_of(run, next((one for one in measured_headings(run) if one.kind == kind), None), width_m=width_m)
 
 
 def gyro_line(recording: Recording) -> PastLines:
-    """Return the one line of a recording's gyro that fits the reference of the whole drive."""
+    """Return the line (scale and bias) of a recording's gyro, fitted to the reference of the whole drive."""
     gyro = recording.track.gyro
     line = GyroLine(1.0, 0.0, 0.0) if gyro is None else _gyro_line(recording, gyro)
     return PastLines(np.zeros(1, np.int64), np.array([line.scale]), np.array([line.bias_radps]))
 
 
 def _gyro_line(recording: Recording, rate: Floats) -> GyroLine:
-    """Return the line that maps a turn rate (n,) to the turns of a recording's reference."""
+    """Return the line (scale and bias) that maps a turn rate (n,) to the turns of a recording's reference."""
     track = recording.track
     return fit_gyro_line(track.t, rate, track.cumulate(rate), track.t, track.heading)
 
@@ -157,7 +157,7 @@ class LeftOut(NamedTuple):
 
 
 class CalibrationResult(NamedTuple):
-    """A calibration with the table that it was tested by."""
+    """A calibration, and the held-out table with its errors."""
 
     calibration: Calibration
     table: held_out.HeldOut
@@ -175,8 +175,8 @@ def calibrate_recordings(
     ----------
     recordings : one or many, of one robot
     robot : the robot that the calibration states; default: without a name
-    findings : notes that a user needs before use
-    grounds : name of the ground of each recording; with two and more, each ground is left out in turn
+    findings : notes that a user needs before using the calibration
+    grounds : name of the ground of each recording; with two or more names, each ground is left out in turn
 
     Raises
     ------
@@ -262,12 +262,12 @@ def calibration_from(
 
 
 def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: float) -> float | None:
-    """Return the standard deviation of the multiplier between the logs of a calibration; None of one or two logs.
+    """Return the standard deviation of the multiplier between the logs of a calibration; None for one or two logs.
 
     Notes
     -----
-    The variance of the logs beyond their own uncertainty (`between_variance`), pooled with the variance of other
-    robots.
+    The variance between the logs beyond their own uncertainty (`between_variance`) is pooled with the variance of
+    other robots.
     """
     if len(table.recordings) < FEWEST_POOLED:
         return None
@@ -281,7 +281,7 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return the function that gives the errors of a calibration in trials of a recording, with its own constants."""
+    """Return a function for the errors of a calibration in trials of a recording, with the recording's constants."""
     fitted = model_for(calibration, recording, with_gyro=with_gyro)
     found = fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]
@@ -298,7 +298,7 @@ def model_for(calibration: Calibration, recording: Recording, *, with_gyro: bool
     Raises
     ------
     ConfigError
-        The calibration is of a robot of another width; or with_gyro, and one of the two has no gyro.
+        The calibration is of a robot of another width; or `with_gyro` is set, and calibration or recording has no gyro.
     """
     if abs(recording.width_m - calibration.width_m) > 1e-3 * calibration.width_m:
         why = f"{recording.width_m:g} m, the calibration is of a robot of {calibration.width_m:g} m"
@@ -321,9 +321,9 @@ def calibrate(runs: Run | Sequence[Run] | Mapping[str, Sequence[Run]], *, allow_
 
     Parameters
     ----------
-    runs : of `icrtool.fit` or `icrtool.open_run`, of one robot; of many, those are left out that are not usable, too
-        short, copies of another, or a part of one. By the name of the ground that they were driven on, each ground is
-        left out in turn: a report with the calibration then answers for another ground
+    runs : of `icrtool.fit` or `icrtool.open_run`, of one robot. Of several runs, a run is left out if it is not usable,
+        too short, a copy of another run, or a part of another run. In a mapping from names of grounds to runs, each
+        ground is also left out in turn: a report with the calibration then states the distance on another ground
     allow_unusable : take runs that are not usable, too
 
     Raises
@@ -345,7 +345,7 @@ def calibrate(runs: Run | Sequence[Run] | Mapping[str, Sequence[Run]], *, allow_
 def calibrate_runs(
     runs: Iterable[Run], *, allow_unusable: bool = False, grounds: Iterable[str] = ()
 ) -> CalibrationResult:
-    """Calibrate as `calibrate` does, with the table of the test; one run at a time is held.
+    """Calibrate as `calibrate` does, and return the held-out table too; only one run at a time is in memory.
 
     `grounds` names the ground of each run, or none.
     """
@@ -388,7 +388,7 @@ class _Taken(NamedTuple):
     Attributes
     ----------
     positions : complex (m,), of its fixes, north + i east [m]
-    notes : of its use together with other runs
+    notes : notes for its use together with other runs
     ground : name of its ground; empty where none was given
     """
 
@@ -450,7 +450,7 @@ def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
 
 
 def use_notes(run: Run, *, alone: bool = True) -> tuple[Note, ...]:
-    """Return what to know of a run before a calibration from it is used; `alone`: it is from no other."""
+    """Return the notes for the user of a calibration from a run; `alone`: the calibration is from no other run."""
     found: list[Note] = []
     if alone:
         found += [] if run.usable else [note("run_not_usable", f"not usable: {run.document.unusable_because}")]

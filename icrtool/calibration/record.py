@@ -66,14 +66,14 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     models : every model that was fitted, by name
     gyro : the recommended model with a gyro, None where a log has none
     logs : what it was fitted to
-    held_out : scores by model, horizon and log, each predicted without that log, or block of a single one
+    held_out : scores by model, horizon and log, each predicted without that log; of a single log, by block
     held_out_pooled : scores of all these trials together
     geometry, geometry_std : ICRs [m], multiplier and radius factors, from one fit
     controller : numbers for a controller, and their errors where the drive is long enough to measure them
     error_sources : variances of what the model leaves out, for wheels alone; None where the drive is too short
     notes : what to know before use; `warnings` : their sentences
     created : date and time, UTC, ISO 8601
-    name : stem of the file that it was read from, which does not hold it
+    name : stem of the file that the calibration was read from; the file does not hold this name
 
     Raises
     ------
@@ -192,13 +192,14 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m, source)
 
     def prior(self, *, corrected: LogConstants | None = NO_CONSTANTS, heading_source: str | None = None) -> TermsPrior:
-        """Return what it shows of the robot's next drive, for `icrtool.AdaptiveModel` to begin with.
+        """Return what the calibration shows of the robot's next drive, as a start for `icrtool.AdaptiveModel`.
 
         Parameters
         ----------
-        corrected : constants of the sensors that are corrected in what the model observes. One that is NaN was found in
-            the drive itself: its usual spread about zero is left. None: all are corrected, and begin at zero. Default:
-            nothing is corrected, and the model begins with the constants of the calibration
+        corrected : constants of the sensors that are corrected already in the data that the model observes. NaN: the
+            constant was found in the drive itself, and its usual spread about zero remains. None: all constants are
+            corrected, and begin at zero. Default: no constant is corrected, and the model begins with the constants of
+            the calibration
         heading_source : as ``heading.source`` of run.json; the calibration's heading offset is used for a heading of
             this source alone. Default: the source of its logs
         """
@@ -276,7 +277,7 @@ def fitted_document(
 
 
 MULTIPLIER_BETWEEN_SHARE = 0.02
-"""Standard deviation of the multiplier between drives of one robot on one kind of ground, as a share of it.
+"""Standard deviation of the multiplier between drives of one robot on one kind of ground, as a share of the multiplier.
 
 Ten recorded drives of a Warthog differ by 1.4 %, 60 simulated robots with two drives each by 1.9 %."""
 
@@ -287,7 +288,7 @@ RADIUS_BETWEEN_STD = 0.006
 def controller_numbers(
     geometry: TrackGeometry, covariance: Floats, robot: documents.CalibratedRobot, *, shared_std: float | None = None
 ) -> ControllerNumbers:
-    """Return multiplier and radius factors with one standard deviation each, of this drive and between drives.
+    """Return multiplier and radius factors, each with its standard deviations in this drive and between drives.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ def with_motion(run: Run) -> RunDocument:
     )
     if found is None:
         return _with_verdict(document)
-    # The common error of both y ICRs cancels in the multiplier: each number is shown by its own deviation.
+    # The common error of both y ICRs cancels in the multiplier, so its own standard deviation decides.
     numbers = controller_numbers(geometry, covariance, robot)
     if of_filter or numbers.multiplier_std <= WEAK_SHARE * abs(numbers.multiplier):
         document = msgspec.structs.replace(document, controller=numbers)
@@ -89,11 +89,13 @@ def with_motion(run: Run) -> RunDocument:
 
 
 def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocument:
-    """Return the document of a run with what it does not show; not usable where it shows no y ICR and no multiplier.
+    """Return the document of a run, which states what the drive does not show.
+
+    A run that shows neither a y ICR nor the multiplier is not usable.
 
     Parameters
     ----------
-    multiplier_std : of a multiplier that is not shown, in words
+    multiplier_std : standard deviation of a multiplier that is not shown, as text
     """
     if not document.usable:
         return document
@@ -117,7 +119,7 @@ def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocumen
 
 
 class Model(NamedTuple):
-    """ICRs that predict motion from wheel speeds: per start, or one triple; `knows` as in `ComparedRow`."""
+    """ICRs that predict motion from wheel speeds: three per start, or three for all; `knows` as in `ComparedRow`."""
 
     name: str
     icrs: FrozenIcrs
@@ -148,7 +150,7 @@ def adaptive_rows(
     *,
     refit_sensors: bool = False,
 ) -> list[ComparedRow]:
-    """Return row ``adaptive`` of a recording, and the one with the measured heading of a kind where it has one.
+    """Return row ``adaptive`` of a recording, and the row with the measured heading of kind `heading` if there is one.
 
     Parameters
     ----------
@@ -165,11 +167,11 @@ def adaptive_rows(
 
 
 class ComparedModels(NamedTuple):
-    """The test of those rows of a report that do not come from the filter.
+    """The rows of a report that do not come from the filter, and their test.
 
     Attributes
     ----------
-    table : of the run's recording: its trials, blocks of distance, and fits
+    table : held-out table of the run's recording: its trials, blocks of distance, and fits
     track : the run's drive
     heading : kind of the measured heading that rows use, ``gyro`` or ``heading``; empty without one
     notes : what was left out of the table and why, and what was corrected
@@ -198,7 +200,8 @@ def compare_models(
     ----------
     run : a finished run, or one read back
     headings : measured headings, best first, for the models with a measured turn rate
-    calibrations : row ``adaptive`` begins with the first one that was not fitted to this log, else with other robots
+    calibrations : row ``adaptive`` begins with the first one that was not fitted to this log; without one, with what is
+        known of other robots
     past : the run with the poses that were known when it was driven; default: its own, of the filter
     refit_sensors : row ``adaptive`` begins without the constants of the calibration's sensors
 
@@ -271,7 +274,7 @@ def _rows(run: Run, found: HeldOut, kind: str, past: Recording) -> Iterator[Comp
     if found.has_gyro:
         (recording,) = found.recordings
         for one in models_of(run):
-            # Both have the middle of the ICRs at the origin: with a measured turn both would equal no_slip_gyro.
+            # Rows for comparison have the middle of the ICRs at the origin: with a measured turn each is no_slip_gyro.
             if not row_of(one.name).compared:
                 of_past = one.name == "icr"
                 lines = partial(past_gyro_lines, past.track) if of_past else partial(pooled.gyro_line, recording)
@@ -326,12 +329,12 @@ def _errors_turned(
 
     Parameters
     ----------
-    lines : scale and bias of the gyro, each from one state on
+    lines : scales and biases of the gyro; each pair holds from one state on
 
     Notes
     -----
-    With omega measured, displacement is the sum of V e^{j psi}, V the mean track speed, and
-    ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j: W drops out.
+    If omega is measured, the displacement has two terms: the sum of V e^{j psi} dt, with the mean track speed V, and
+    ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j. It does not depend on W = y_r - y_l.
     """
     track, (first_rows, scales, biases) = recording.track, lines()
     gyro = track.gyro if track.gyro is not None else np.zeros(len(track.t))

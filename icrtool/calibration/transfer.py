@@ -1,4 +1,4 @@
-"""Comparison of groups of runs: their parameters, the differences, and the error of one's calibration on another.
+"""Comparison of groups of runs: parameters, differences, and errors of the calibration of one group in another.
 
 An element of the transfer matrix holds the errors of the row's calibration in the trials of the column's runs. On the
 diagonal both are the same group. There each trial is predicted by a fit without its log or, in a group of a single run,
@@ -122,7 +122,7 @@ def compare_calibrations(
 def _verdict(
     first: str, second: str, parameters: Sequence[documents.ParameterDifference], cost: documents.TransferCost
 ) -> str:
-    """Return one sentence: how the multiplier differs, and what the calibration of the first costs on the second."""
+    """Return one sentence: how the multiplier differs, and what the first calibration adds to the second's errors."""
     one = next(one for one in parameters if one.quantity == "multiplier")
     change = with_std(one.difference, one.std)
     differs = f"The multiplier of {second} differs from the multiplier of {first} by {change}"
@@ -145,7 +145,7 @@ class _Tested(NamedTuple):
 
 
 def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bool) -> _Tested:
-    """Test a calibration in recordings; with `own`, each is predicted by a fit that does not contain it."""
+    """Test a calibration in recordings; with `own`, each trial is predicted by a fit that does not contain it."""
     errors, path, before = [], [], 0.0
     for i, one in enumerate(recordings):
         trials = cut_trials(one, TRANSFER_HORIZONS_M)

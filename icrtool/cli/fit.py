@@ -88,7 +88,7 @@ def fit_command(
                 error(f"{run.name}: do not use this run: {run.document.unusable_because}")
             where = escaped(str(directory))
             document |= {"directory": where, "run": run.summary}
-            # The command that names what is wrong in the log.
+            # The command that states what is wrong with the log.
             examine = shlex.join(["icrtool", "info", escaped(str(log)), "-v", *options.given(settings, request)])
             printer.show([*run_tables.run_blocks(run.document), *run_tables.next_blocks(run.document, where, examine)])
             printer.warn_of(run, most=MOST_WARNINGS)
@@ -101,9 +101,9 @@ def fitted_log(
     log: Path, place: RunPlace, config: Config, request: FitRequest, files: ResultFiles, printer: Printer,
     warm_start: Path | None = None, *, warns: bool = True,
 ) -> Iterator[tuple[Run, Path]]:  # fmt: skip
-    """Fit a log, and give as `icrtool.pipeline.fit_into` does; with `warns`, print its warnings and streams on stderr.
+    """Fit a log, and yield as `icrtool.pipeline.fit_into` does; with `warns`, print warnings and streams on stderr.
 
-    A run of other settings is not replaced, unless that is asked for.
+    A run with other settings is replaced only if `files.overwrite` is set.
     """
     if not (files.overwrite or isinstance(place.directory, UrlPath)):
         run_directory.check_target(place.directory, log, inside=place.inside)
@@ -207,7 +207,7 @@ def _examine(
         )
     elif printer.shows:
         printer.show(overview.info_blocks(holds, measured, run, problem, names, config, command, scorable))
-    # On a terminal the answer names the gravest one.
+    # On a terminal the result names the gravest warning, so warnings are printed only with -v or --json.
     if printer.verbose or printer.as_json or not sys.stderr.isatty():
         printer.warn(warnings)
     if problem is not None:

@@ -41,7 +41,7 @@ def logs_of(places: tuple[Path, ...], printer: Printer) -> tuple[Path, ...]:
 
 
 def runs_or_logs(place: Path) -> list[Path]:
-    """Return the runs in a folder, or else its logs; a run or log is itself."""
+    """Return the runs in a folder or, if it has none, its logs; a run or a log is returned itself."""
     if not isinstance(place, UrlPath):
         if run_directory.is_run_directory(place) or not place.is_dir():
             return [place]
@@ -54,7 +54,7 @@ def runs_or_logs(place: Path) -> list[Path]:
 
 
 def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run]:
-    """Read runs, and fit logs without a recommendation; nothing is written."""
+    """Read runs, and fit logs with the filter alone, without a recommended model; nothing is written."""
     found = []
     with printer.progress("reading") as progress:
         for path in paths:
@@ -68,7 +68,7 @@ def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[
 
 
 def check_run_config(config: Config, *, free: str = "") -> None:
-    """Refuse settings for a finished run, but those of the section that a report on it is free to change."""
+    """Refuse settings for a finished run, except settings of section `free`, which a report may change."""
     if given := sorted({key.partition(".")[0] for key in config.given} - {free}):
         advice = "fit the log again with it, or name the log in place of its run"
         raise errors.ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
@@ -101,7 +101,7 @@ class RunPlace(NamedTuple):
 def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[RunPlace]:
     """Return where each log's run goes: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` for several or `into`.
 
-    Logs of one name are distinguished by what their paths differ in.
+    Logs with the same name get names from the parts in which their paths differ.
     """
     output, into = place
     if output is not None and into is not None:
@@ -162,7 +162,7 @@ def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
 
 
 def _expanded(place: Path) -> list[Path]:
-    """Return what a pattern names, which a shell does not expand behind ``NAME=``; else the place itself."""
+    """Return the files of a pattern, which a shell does not expand after ``NAME=``; without one, the place itself."""
     if isinstance(place, UrlPath) or place.exists() or not glob.has_magic(str(place)):
         return [place]
     found = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute

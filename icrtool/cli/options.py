@@ -1,6 +1,7 @@
-"""Options that several commands share, and what reads their values.
+"""Options that several commands share, and the functions that read their values.
 
-Each is declared by `option`, `choice` or `flag`; those that go together reach the command as one argument (`together`).
+Each option is declared by `option`, `choice` or `flag`. Options that belong together reach the command as one argument
+(`together`).
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ Record = TypeVar("Record")
 Change = Callable[[Record], Record]
 
 REQUESTS_MODULE = "icrtool.records.requests"
-"""Where the records are that options make, imported when a command is called."""
+"""Module of the records that are made from options; it is imported when a command is called."""
 
 
 class _Positive(click.FloatRange):
@@ -98,7 +99,7 @@ class GroupedCommand(click.Command):
 
 
 def command(name: str, **further: Any) -> Callable[[Command], click.Command]:
-    """Return what makes a command of many options, whose help lists the usual ones first."""
+    """Return a decorator that makes a command, whose help lists the usual options first."""
     return click.command(name, cls=GroupedCommand, **further)
 
 
@@ -107,8 +108,8 @@ def option(names: str, metavar: str | None, kind: object, text: str, **further: 
 
     Parameters
     ----------
-    names : as ``-o --output directory``: the last one, if it has no dash, is that of the argument
-    kind : type of the value, or what reads it
+    names : as ``-o --output directory``: the last name, if it has no dash, is the name of the argument
+    kind : type of the value, or the function that reads it
     text : help
     further : as click has it
     """
@@ -127,14 +128,15 @@ def flag(names: str, text: str, **further: Any) -> Option:
 
 
 def together(name: str, home: str | Callable[..., Any], *options: Option, change: bool = False) -> Option:
-    """Return what adds options to a command, in this order, and gives it a record of them as one argument.
+    """Return a decorator that adds options to a command, in this order, and passes a record of them as one argument.
 
     Parameters
     ----------
     name : of the argument
-    home : the record, or where it is: ``icrtool.config:ConfigSources``, imported when the command is called. Those of
-        the options that have the names of its fields become these, if they are given; the command gets the others
-    change : the argument changes a record, a dataclass, by the options that are given
+    home : type of the record, or its place as ``icrtool.config:ConfigSources``, which is imported when the command is
+        called. An option with the name of a field sets this field, if the option is given. The command receives the
+        other options
+    change : the argument is a function that returns a dataclass with the given options changed
     """
     bare = add_options(lambda: None, *options)
     known = {one.name for one in bare.__dict__.get("__click_params__", ())}.union(bare.__dict__.get("made", ()))
@@ -167,12 +169,12 @@ def add_all(*options: Option) -> Option:
 
 
 class _Path(click.Path):
-    """A place on disk, or also an address.
+    """A path on disk or, with `addresses`, also an address.
 
     Parameters
     ----------
-    addresses : they are taken, and what click checks of a log is left to its reader, which has its own message
-    check : where the function is that refuses a place that cannot be written, before any work is done
+    addresses : addresses are accepted. The reader of a log, not click, checks that it can be read, with its own message
+    check : place of a function (``module:function``) that refuses an unwritable place before any work is done
     """
 
     def __init__(self, *, addresses: bool = False, check: str = "") -> None:
@@ -188,7 +190,7 @@ class _Path(click.Path):
         if isinstance(address, UrlPath):
             if not self._addresses:
                 self.fail(f"{escaped(str(address))}: an address is not taken here; name a place on disk", param, ctx)
-            # click's own would lose a slash, and what stands behind a question mark.
+            # click's own conversion would lose a slash, and the text after a question mark.
             return address
         path = cast("Path", super().convert(value, param, ctx))
         if self._check:
@@ -203,7 +205,7 @@ NEW_PICTURE = _Path(check="icrtool.output.files.formats:check_picture")
 
 
 def numbers(form: str, count: int | None = None) -> Callable[[str], tuple[float, ...]]:
-    """Return what reads numbers separated by commas; `form` is what they shall look like."""
+    """Return a function that reads numbers separated by commas; `form` is their form, for the error message."""
 
     def read(text: str) -> tuple[float, ...]:
         try:
@@ -245,7 +247,7 @@ def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str
 def topics_of(logs: object) -> tuple[str, ...]:
     """Return the topics of the logs that were named before, as far as they can be read and are names of ROS.
 
-    Bash puts a completion into the line without quoting it: no other text of a log must come there.
+    Bash puts a completion into the line without quoting it: no other text of a log may come there.
     """
     topics: set[str] = set()
     for log in logs if isinstance(logs, tuple | list) else ():
@@ -261,7 +263,7 @@ def topics_of(logs: object) -> tuple[str, ...]:
 
 
 def _limit(variable: str, read: str) -> Callable[[click.Context, click.Parameter, str | None], None]:
-    """Return what reads the value of an option that limits inputs, and sets it for the time of the command.
+    """Return a callback that reads the value of an input limit, and sets this limit while the command runs.
 
     Parameters
     ----------
@@ -358,7 +360,7 @@ ALLOW_UNUSABLE = flag("--allow-unusable", "Give distances and numbers of runs th
 
 
 def _lines(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:
-    """Return limits, of which a text may hold several; one that is all blank stays, and is refused as no limit."""
+    """Return the limits, one per line of each text. A blank text is kept, so that it is refused as an invalid limit."""
     lines = tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
     for line in lines:
         try:
@@ -373,7 +375,7 @@ def _lines(_context: click.Context, _option: click.Parameter, gates: tuple[str, 
 
 
 class Exports(NamedTuple):
-    """What machines that watch pull requests read, by --junit and --markdown."""
+    """Files for CI: JUnit XML (--junit) and a summary for a pull request (--markdown)."""
 
     junit: Path | None = None
     markdown: Path | None = None
@@ -387,7 +389,7 @@ class Exports(NamedTuple):
 
 
 def reporting(*further: Option) -> Option:
-    """Add the options of a report as `report`, `files`, `exports` and `baseline`; `further`: those of one command."""
+    """Add the options of a report as `report`, `files`, `exports` and `baseline`; `further`: options of one command."""
     return together("exports", Exports, together("files", f"{REQUESTS_MODULE}:ResultFiles", together(
         "report",
         f"{REQUESTS_MODULE}:ReportRequest",
@@ -436,7 +438,7 @@ def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
 
 
 def given(settings: ConfigSources, request: FitRequest) -> list[str]:
-    """Return the options of a call that the next command takes too."""
+    """Return the options of this call that the next command needs too."""
     pairs = [("--config", settings.file), ("--robot", settings.robot), *(("--set", one) for one in settings.sets)]
     pairs += [("--from", request.start), ("--to", request.end)]
     return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]

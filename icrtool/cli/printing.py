@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 CLEAR = "\r\x1b[K"
 REFRESH_S = 0.1
-"""The share done is rewritten at most this often."""
+"""Shortest time between two updates of the share done on a terminal [s]."""
 
 WIDEST = 120
-"""Columns of a terminal that are used."""
+"""Largest number of columns of a terminal that are used."""
 
 FEWEST_COLUMNS = 3
-"""Columns of a table that stay on the narrowest terminal."""
+"""Smallest number of columns of a table that are shown, however narrow the terminal is."""
 
 TEXT_STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
 
@@ -125,12 +125,12 @@ class Printer(NamedTuple):
             show(blocks, verbose=self.verbose)
 
     def text(self, text: str) -> None:
-        """Print a result that is laid out."""
+        """Print a result that is text already."""
         if self.shows:
             click.echo(text)
 
     def json(self, command: str, document: msgspec.Struct | Mapping[str, object]) -> None:
-        """Print the document of a command, with --json; its schema is ``icrtool/<command>/1``, whatever it states.
+        """With --json, print the document of a command; its own schema is replaced by ``icrtool/<command>/1``.
 
         Parameters
         ----------
@@ -157,9 +157,9 @@ class Printer(NamedTuple):
     def warn_of(self, run: Run, *, most: int | None = None) -> None:
         """Print the warnings of a run, with -v also why each stream was chosen.
 
-        `most`: only so many of them, the gravest first, and how many more there are; -v and --json print all.
+        `most`: print at most this number, the gravest first, and how many more there are; -v and --json print all.
         """
-        # On a terminal the answer names the gravest one.
+        # On a terminal the result names the gravest warning, so warnings are printed only with -v or --json.
         if self.verbose or self.as_json or most is None:
             self.warn(run.warnings if self.verbose or self.as_json or not sys.stderr.isatty() else ())
         elif not sys.stderr.isatty():
@@ -178,7 +178,7 @@ class Printer(NamedTuple):
 
     @contextmanager
     def progress(self, label: str) -> Iterator[Callable[[float], None]]:
-        """Give a function that shows the share done of work of one stage."""
+        """Yield a function that shows which share of the work of one stage is done."""
         with Stages(label, quiet=self.quiet) as stages:
             stages.begin("")
             yield stages.share
@@ -222,7 +222,7 @@ class Inputs:
 
 
 class LiveLine:
-    """A line on a terminal about what is being done; what is printed next begins at its left."""
+    """A line on a terminal about what is being done; the next output begins at the left end of this line."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         self.on_terminal = not quiet and sys.stderr.isatty()
@@ -241,7 +241,7 @@ class LiveLine:
 
 
 class Stages(LiveLine):
-    """The stages of the work on one log; ended, nothing of them stays on a terminal.
+    """The stages of the work on one log; at the end they are erased from the terminal.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ class Stages(LiveLine):
             click.echo(f"{self.name}: {stage}", err=True)
 
     def share(self, done: float) -> None:
-        """Show which share of the stage is done, 0 to 1; at the end of it, only the stage."""
+        """Show which share of the stage is done, 0 to 1; at 1 only the name of the stage is shown."""
         now_s = time.monotonic()
         if self.on_terminal and now_s - self._shown_s >= REFRESH_S:
             self._shown_s = now_s

@@ -69,7 +69,7 @@ def dropout(
     horizons_m : distances without GNSS, in any order; default: from the run's configuration
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     models : models that predict; default `models_of` of the run
-    seed : of the random draws of the reference's own error
+    seed : seed of the random draws of the reference's own error
     sink : receives every single error (for ``--trials``)
 
     Returns
@@ -135,17 +135,17 @@ def dropout_report(
     run : of `icrtool.fit` or `icrtool.open_run`
     horizons_m, budgets_m : distances without GNSS [m]; largest allowed errors [m], for which the distance is reported
     gates, strict_gates, allow_unusable : acceptance limits, and how they are checked
-    outage_s, outage_at_s : lengths and begins of forced outages [s]
+    outage_s, outage_at_s : lengths and start times of forced outages [s]
     starts, reference : states that trials start from; estimates that trials are compared with
-    without_events, with_jumps : which trials count
+    without_events, with_jumps : leave out trials across slip events; count trials across jumps of the reference
     refit_sensors : heading offset, delays and gyro bias are refitted in this log for `calibrations`
     ladder, seed : whether models are tested on held-out distance; seed of the random draws
     score : topics of poses in the log; each becomes a row ``topic:NAME``
     log : the log of the run, in a form that `icrtool.read_log` takes; scored topics are read from it
-    calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`. Each becomes a row ``calibration``, or
-        ``calibration:STEM`` with the stem of its file where there are several, and a row with ``_gyro`` at the end
-        where both have a gyro. Row ``adaptive`` begins with the first calibration that was not fitted to this log;
-        without one, with other robots
+    calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`. Each becomes a row ``calibration``; if there
+        are several, ``calibration:STEM`` with the stem of its file. If calibration and log both have a gyro, there is
+        also a row with the suffix ``_gyro``. Row ``adaptive`` begins with the first calibration that was not fitted to
+        this log, or without such a calibration with what is known of other robots
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
@@ -213,7 +213,7 @@ def report_on(
     forced = [outage for plan in plans for outage in shown_paths.force_outages(run, plan)]
     compared = with_smoothed_reference(run) if request.reference == "smoothed" else run
     unusable = "" if run.usable or request.allow_unusable else str(run.document.unusable_because)
-    # Computed and released before the comparison, whose columns are as large: this bounds memory.
+    # Both are computed and released before the models are compared, which needs columns of the same size.
     examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, request.starts)
     give_back_freed()
     used, further, of_sensors = _calibration_rows(compared, run, () if unusable else calibrations, request)
@@ -310,7 +310,7 @@ def _report(
     Parameters
     ----------
     errors : errors of its models
-    with_events : errors of all trials, where the trials of `errors` cross no slip event
+    with_events : errors of all trials; given where `errors` leaves out the trials that cross a slip event
     notes : notes about the rows, in addition to the run's notes
     """
     made = None if found is None else found.calibration
@@ -376,7 +376,7 @@ def _counts(
     errors: report.OpenLoopErrors, with_events: report.OpenLoopErrors | None
 ) -> Iterator[documents.CountDocument]:
     """Yield how many starts gave a trial at each horizon, and why the others gave none."""
-    # starts at a gap, at an outage or at a standstill are counted the same with and without the option
+    # The reasons are counted over all trials: with the option, a slip event would be counted as a gap.
     counts = (with_events or errors).counts
     crossing = counts.trials - errors.counts.trials
     driven = distance_text(errors.run_document.drive.distance_m)
@@ -436,7 +436,7 @@ def forced_lengths_s(run: Run, request: ReportRequest) -> Sequence[float]:
 def with_other_grounds(
     budgets: Iterable[BudgetDistance], calibrations: Sequence[UsedCalibration]
 ) -> tuple[BudgetDistance, ...]:
-    """Return distances within budgets with their ends on another ground, of rows that come from calibrations."""
+    """Return the distances within budgets; rows of calibrations also get their interval on another ground."""
     scores = {
         one.name: one.calibration.other_grounds or ()
         for one in calibrations

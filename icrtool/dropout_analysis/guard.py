@@ -18,7 +18,7 @@ FEWEST_TRIALS = 30
 """Number of trials that a row needs. The 95th percentile of fewer trials is their largest or second largest error."""
 
 SMALLEST_SHARE_TRIED = 0.1
-"""Share of the starts from which a row needs an error. A row with fewer was tested on a chosen part of the drive."""
+"""Share of the starts for which a row needs an error. With less, only a chosen part of the drive was tested."""
 
 LARGEST_ROW_RATIO = 3.0
 """Ratio of the errors of `recommended` and `icr` from which on they contradict each other."""
@@ -29,8 +29,8 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
 
     Parameters
     ----------
-    summary : of the run
-    errors : of its rows
+    summary : document of the run
+    errors : errors of the rows
     held_out : names of the rows that are tested on distance they were not fitted to
 
     Notes

@@ -65,8 +65,8 @@ class OpenLoopErrors:
     horizons_m : (h,) ascending
     results : one per model
     counts : trials, and starts without a trial, by horizon; the same for every model
-    states : recorded states
-    standing : states in which the robot stood: their trials are nearly equal
+    states : number of recorded states
+    standing : number of states in which the robot stood; the trials of one standstill are nearly equal
     reference : errors that a perfect model would show, by horizon
     by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
     """
@@ -98,8 +98,8 @@ class DropoutReport(OpenLoopErrors):
     reference_north_m, reference_east_m : (n,) positions that trials are compared with, at every state
     usable : distances and numbers may be used, or the request accepts an unusable run
     worst, examples, outages : the same as in `document`, with their paths
-    path_errors : the error of every trial of the row of `worst`, by its start; None where there is no trial so long
-    calibration : from this run alone, the model of row `recommended`; None where it was left out
+    path_errors : errors of all trials of the row in `worst`, by start; None where no trial is long enough
+    calibration : the model of row `recommended`, fitted to this run alone; None where it was left out
     baseline : an earlier report that this report is compared with
     """
 
@@ -177,9 +177,9 @@ class BaselineReport:
 
     Attributes
     ----------
-    log : name of its log; path : of the report
-    document : what it holds
-    drives : of `pooled_baseline`, the reports of other drives that `document` is the mean of; else none
+    log : name of the log; path : path of the report
+    document : content of the report
+    drives : of `pooled_baseline`, the reports whose mean is `document`; otherwise empty
     """
 
     log: str
@@ -189,7 +189,7 @@ class BaselineReport:
 
     @property
     def sha256(self) -> tuple[str, ...]:
-        """SHA-256 of each file of its log; none where one is not known."""
+        """SHA-256 of each file of the log; empty where the SHA-256 of one file is not known."""
         return known_content(one.sha256 for one in self.document.run.inputs)
 
     @property
@@ -258,13 +258,14 @@ class BaselineReport:
         Parameters
         ----------
         now : block sums of the number
-        same : both are of the same recording
+        same : number and baseline are of the same recording
 
         Notes
         -----
-        Of pooled drives: the variance between drives, as these show it and as it is known of other robots
-        (`icrtool.kernels.error_statistics.pooled_variance`), of the new drive and of the mean, and that of the blocks
-        of the new drive.
+        With pooled drives two half widths are added in squares. The first comes from the variance between drives,
+        once for the new drive and once for the mean of the others. This variance is pooled from the given drives and
+        other robots (`icrtool.kernels.error_statistics.pooled_variance`). The second comes from the blocks of the new
+        drive.
         """
         if not self.drives:
             return difference_half_width(now, self.at(model, horizon_m)[1], metric, factor, paired=same)
@@ -283,16 +284,16 @@ class BaselineReport:
 
 
 def pooled_baseline(drives: Sequence[documents.DropoutDocument], log: str, path: str) -> BaselineReport:
-    """Return the reports of several drives as one baseline, for a drive that is none of them.
+    """Return the reports of several drives as one baseline; the drive to compare is not one of them.
 
     Parameters
     ----------
     drives : at least one, of the same robot
-    log : what the baseline is called; path : where the reports are
+    log : name of the baseline; path : place of the reports
 
     Notes
     -----
-    A number of the baseline is the geometric mean of those of the drives: errors of drives differ by a factor.
+    Each number of the baseline is the geometric mean over the drives, because errors of drives differ by a factor.
     """
     first, models = drives[0], []
     for model in first.models:
@@ -353,7 +354,7 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
                 within_budget(report.horizons_m, result.column(name), budget_m)
                 for name in ("p95_high_m", "p95_low_m", "p95_next_high_m", "p95_next_low_m")
             )
-            # A bound that stays within the budget at every horizon with an interval has no such distance.
+            # No distance is known for a bound that stays within the budget at every horizon with an interval.
             low, high, next_low, next_high = (None if end is None or end[1] else end[0] for end in ends)
             quiet = documents.column_of(result.without_events, "p95_m")
             free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
@@ -403,19 +404,20 @@ def best_row(
 
 
 HALF_OF_SQUARE = math.sqrt(0.5)
-"""Ratio of two errors of which one has half of the square of the other: independent parts of an error add in
-squares."""
+"""Ratio of two errors if the square of the first is half of the square of the second.
+
+Squares are compared because independent parts of an error add in squares."""
 
 ESTIMATED_HEADINGS = ("gyro_course", "wheels_course")
 """Sources of a heading that no sensor measures."""
 
 
 def start_heading(result: documents.ModelResult, h: int, source: str) -> documents.StartHeading | UnsetType:
-    """Return what the headings at the start of trials cost at horizon number `h`; unset where that is not known.
+    """Return how much of the error at horizon number `h` comes from the start headings; UNSET where it is not known.
 
     Parameters
     ----------
-    source : of the heading, as in run.json
+    source : source of the heading, as in run.json
     """
     aligned = result.aligned[h] if result.aligned else None
     if aligned is None:
@@ -510,11 +512,11 @@ def check_gate(
 
 
 def verdict_on(gate: Gate, log: str, *, passed: bool, **found: float | str | None) -> Verdict:
-    """Return a limit that was checked, with the line about it, which names the log.
+    """Return the verdict on an acceptance limit, with a line that names the log.
 
     Parameters
     ----------
-    found : further fields of `Verdict`; a number that is not finite is not known
+    found : further fields of `Verdict`; a number that is not finite becomes None
     """
     fields = {"value_m": None} | {name: plain(value) for name, value in found.items()}
     checked = Verdict(*astuple(gate), passed=passed, verdict="", **fields)

@@ -39,7 +39,7 @@ def standing_states(track: Track) -> Bools:
 
 
 def counted_ends(track: Track, horizons_m: Floats, counted: Starts, starts: Ints | None = None) -> Rows:
-    """Return `ends_from` some starts, default all states; starts that do not count are marked."""
+    """Return the ends of trials (`ends_from`) from `starts`, else all states; starts that do not count are marked."""
     starts = starts if starts is not None else np.arange(len(track.distance))
     ends = ends_from(track, horizons_m, starts)
     if counted == "moving":
@@ -108,7 +108,7 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
     ----------
     run : its states are the reference
     trials : trials of each horizon, in groups
-    seed : of the draws, which begin anew with each group
+    seed : seed of the draws; each group begins with this seed again
 
     Notes
     -----

@@ -42,8 +42,8 @@ from icrtool.records.run import Run, track_of
 from icrtool.records.text import counted
 
 LARGEST_TABLE_BYTES = 96 << 20
-"""Largest memory of the errors held at a time and the ends of their trials [bytes]. Horizons are computed in groups
-that need less, for logs of any length."""
+"""Largest memory of the errors and trial ends that are held at the same time [bytes]. Horizons are computed in groups
+that need less; a group has at least one horizon."""
 
 BYTES_A_TRIAL = 12
 """Memory of one trial [bytes]: its error and the state at which it ends."""
@@ -80,12 +80,12 @@ def measure_errors(
     sink: ErrorSink | None = None,
     track: Track | None = None,
 ) -> OpenLoopErrors:
-    """Return the errors of all models; other parameters and errors as in `icrtool.dropout`.
+    """Return the errors of all models; `icrtool.dropout` describes the other parameters and the exceptions.
 
     Parameters
     ----------
     further : additional models whose numbers do not come from the filter
-    starts_of_further : start states of their trials, and of all heading errors: closer starts give nearly equal trials
+    starts_of_further : start states for `further` and for all heading errors; closer starts give nearly equal trials
     track : `icrtool.records.run.track_of` the run, where it exists already, because it is large for a long log
     """
     if len(run.table) < 2:
@@ -173,7 +173,7 @@ def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], tria
 
 
 class _AtHorizon(NamedTuple):
-    """The errors of one model at one horizon; `free`: of the trials that touch no slip event."""
+    """The errors of one model at one horizon; `free`: errors of the trials that touch no slip event."""
 
     row: documents.SummaryRow
     bins: statistics.Histogram
@@ -240,7 +240,7 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
 
 
 def _row(metres: float, errors: Floats) -> documents.ErrorRow:
-    """Return the errors (n,) [m] at one horizon in numbers."""
+    """Return the statistics of the errors (n,) [m] at one horizon."""
     trials, *numbers = statistics.RankedTrials.of(errors).summary()
     return documents.ErrorRow(metres, trials, *map(known, numbers))
 
@@ -269,18 +269,18 @@ def _at_horizon(
 
     Parameters
     ----------
-    spread : what is known of other drives
+    spread : how errors differ between drives, from other drives
     errors : (n,) [m]; turned : (k,) errors of its turns [rad]
     aligned : (n,) errors with aligned start headings [m], empty for the filter's models
     slipping : (n,) whether a trial touches a slip event
     """
     ranked = statistics.RankedTrials.of(errors)
     trials, expected, p50, p95, largest = ranked.summary()
-    # Bins that show most trials in detail although there are outliers, in at most some hundred bins.
+    # The bins show most trials in detail in spite of outliers; there are at most some hundred bins.
     shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
     bins = ranked.histogram(statistics.round_bin_width(shown_m))
     sums = statistics.block_sums(errors, blocks, ranked, p50, p95)
-    del ranked  # as long as a column of the log, like what the intervals need
+    del ranked  # frees the memory of a column of the log; the intervals need as much
     intervals = statistics.error_intervals(errors, blocks, sums, p50, p95, spread)
     _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.of(np.degrees(turned)).summary()
     shares = 100.0 * expected / metres, 100.0 * p95 / metres

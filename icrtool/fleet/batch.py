@@ -45,7 +45,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
     Parameters
     ----------
     output : folder of the results
-    folder : folder on disk in place of `output`, where that is an address
+    folder : folder on disk that is used where `output` is an address
 
     Raises
     ------
@@ -64,7 +64,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
     if folder.exists() and not folder.is_dir():
         raise OutputError(output, "a file is there", "name another place for the batch")
     check_tables(folder, page=batch.files.page)
-    # A table of simulated truth next to its log, from a pattern of the shell, is no manifest.
+    # A pattern of the shell may also name tables of simulated truth beside their logs. They are no manifests.
     left_out = logs_among([place for place in places if place.is_file()])[1]
     places = [place for place in places if place not in left_out]
     entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
@@ -88,7 +88,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
             raise ConfigError(f"{one.log}: robot {known.robot!r}", "not a built-in robot", advice)
         robot = known.robot if builtin else settings.robot if not known.robot else None
         config = settings._replace(file=known.config or settings.file, robot=robot).load()
-        # The file report.html shows whether the page is there.
+        # The key does not depend on whether a page is asked for: `finished` looks for the file report.html.
         files = replace(batch.files, page=True, overwrite=False)
         asked = [config.effective(), __version__, batch.report, files, known.robot, baseline]
         row = FleetLog(
@@ -150,7 +150,7 @@ def run_batch(
     executor : runs `process_apart`; threads on this machine, or workers of a cluster
     watch : called when a log comes to its next stage, where the executor is on this machine
     lost : returns why the executor can process no log any more; empty while it can
-    folder : folder on disk in place of the place of the results, where that is an address
+    folder : folder on disk that is used where the results go to an address
     """
     todo: list[LogRequest] = []
     for request in requests:

@@ -1,6 +1,6 @@
-"""What a batch writes: tables, figures, acceptance limits for machines that watch pull requests, and calibrations.
+"""What a batch writes: tables, figures, results of acceptance limits for CI, and calibrations.
 
-There is one calibration per robot and group, tested on each log left out.
+There is one calibration per robot and group. It is tested by leaving out each log in turn.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ CALIBRATIONS = "calibrations"
 """Folder of the calibration files, below the folder of the batch."""
 
 MOST_POOLED_S = 86_400.0
-"""Longest time of the logs of a robot and group that is calibrated together [s], evenly spaced over all logs. It takes
-about 1 GB of memory."""
+"""Longest total time of the logs of a robot and group that are calibrated together [s]. Of more logs, some are chosen
+evenly over all of them. This time needs about 1 GB of memory."""
 
 FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
 """Folders that a batch writes."""
@@ -56,7 +56,7 @@ FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", FLEET_FILE)
 
 SHOWN_ERRORS = {MOST_USEFUL: documents.SHOWN_ERROR, WITHOUT_IT: documents.SHOWN_WITHOUT}
-"""The rows whose errors the picture shows, and their columns: the first that a log has."""
+"""Rows whose errors the picture may show, and their columns; it shows the first row that any log has."""
 
 
 def check_tables(folder: Path, *, page: bool) -> None:
@@ -88,7 +88,7 @@ def pictures_of_batch(folder: Path) -> list[Path]:
 
 
 def fleet_document(rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibration] = ()) -> FleetDocument:
-    """Return what fleet.json holds: how many logs were done or failed, all of each, and the pooled calibrations."""
+    """Return what fleet.json holds: how many logs were done or failed, the row of each log, pooled calibrations."""
     counts = Counter(row.status for row in rows) + Counter(row.this_time for row in rows)
     return FleetDocument(
         schema=documents.FLEET_SCHEMA,
@@ -279,12 +279,12 @@ def changes_of(rows: Sequence[FleetLog], missing: Sequence[str]) -> list[str]:
 def pooled_calibrations(
     rows: Sequence[FleetLog], directory: Path, place: Path | None = None, *, allow_unusable: bool = False
 ) -> Iterator[FleetCalibration]:
-    """Yield the calibration of each robot in each group; one of the same logs as before is not fitted again.
+    """Yield the calibration of each robot in each group; a calibration of unchanged logs is not fitted again.
 
     Parameters
     ----------
     directory : of the batch, on disk; calibration files are written below it
-    place : the address in place of which `directory` is used; the runs are there
+    place : address of the batch, where `directory` is its folder on disk; the runs are at this address
     allow_unusable : also from runs that are not usable
     """
     try:
@@ -381,5 +381,5 @@ def _pooled(
 
 
 def _content(inputs: Sequence[FleetFile]) -> tuple[str, ...]:
-    """Return the content of a log's files, equal for copies whatever their names; the place where it is not known."""
+    """Return the SHA-256 of each file of a log, equal for copies; for a file without one, its place and version."""
     return tuple(sorted(file.sha256 or f"at {file.path} {file.bytes} {file.version} {file.address}" for file in inputs))

@@ -35,7 +35,7 @@ FLEET_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 
 
 def path_of(name: bytes) -> Path:
-    """Return a path of a request."""
+    """Return the path that a request holds as bytes."""
     return place_of(os.fsdecode(name))
 
 

@@ -124,9 +124,9 @@ def holds_run_of(directory: Path, log: Path, config: Config, request: FitRequest
 
 
 def changed_settings(directory: Path, config: Config, request: FitRequest) -> list[str]:
-    """Return what is asked of a fit otherwise than of the run in a directory, as ``robot.name was 'a', now 'b'``.
+    """Return the settings in which a fit differs from the run in a directory, as ``robot.name was 'a', now 'b'``.
 
-    The section ``dropout`` is not of the fit. A run that cannot be read has no settings.
+    Section ``dropout`` does not change a fit, so it is not compared. A run that cannot be read has no settings.
     """
     asked = _asked_of(directory)
     if asked is None:
@@ -162,7 +162,7 @@ class _Asked(Record, frozen=True):
 
 
 def _asked_of(directory: Path) -> _Asked | None:
-    """Return what was asked of a run that nobody checked yet; None where it is none."""
+    """Return the settings of a run whose checksums were not compared yet; None where it cannot be read."""
     if isinstance(directory, UrlPath) or not is_run_directory(directory):
         return None
     try:
@@ -214,7 +214,7 @@ def new_run(
         if states != "csv" and note is not None:
             note(f"{directory}: {len(run.table):,} states: written as states.parquet, not states.csv (--states csv)")
     with atomic_directory(directory, RUN, inside) as partial, ThreadPoolExecutor(1) as pool:
-        # Not ".": it would name the old run even after that is renamed.
+        # The real path: "." would still name the old run after the old run is renamed.
         place = Path(os.path.realpath(directory))
         before = set(names_in(place))
         states_written = pool.submit(run_columns.write_states, run.table, partial / f"states.{states}", states)
@@ -299,7 +299,6 @@ def open_run(path: str | Path, *, whole: bool = True) -> Run:
     path : a directory that `icrtool fit` or `Run.write` made, or its address
     whole : hold all columns; otherwise standard deviations of states in Parquet are read where they are used. This
         needs a third less memory, but the file must not change
-
 
     Raises
     ------

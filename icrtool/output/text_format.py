@@ -34,7 +34,7 @@ GLOSSARY = {
 """Meanings of the words on a run's page. The words for rows are in `icrtool.records.rows`."""
 
 MOST_LINES = 50
-"""Largest number of jumps of the reference that are printed, the largest decided ones first."""
+"""Largest number of jumps of the reference that are printed; jumps of decided cause come first, then larger ones."""
 
 
 def run_title(summary: RunDocument) -> str:
@@ -101,7 +101,7 @@ def xml_text(text: str) -> str:
 
 
 def signed(metres: float, digits: int = 3) -> str:
-    """Return a number with its sign, to the millimetre, with a typographic minus instead of a hyphen."""
+    """Return a number with its sign, by default to the millimetre, with a typographic minus instead of a hyphen."""
     return f"{metres:+.{digits}f}".replace("-", "−") if round(metres, digits) else f"{0:.{digits}f}"
 
 

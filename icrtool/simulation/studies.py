@@ -382,7 +382,7 @@ STUDIES: dict[str, Study] = {
 
 
 def default_request(name: str, config: Config) -> StudyRequest:
-    """Return the request of a study: the paper's parameters; the configuration's robot for preset ``field``'s start."""
+    """Return the request of a study: the paper's parameters, and the robot of `config` for the start of ``field``."""
     if config.robot.track_width_m is None:
         config = replace(config, robot=replace(config.robot, track_width_m=PAPER_TRACK_WIDTH_M))
     study = STUDIES[name]

@@ -38,7 +38,7 @@ FATES = ("converged", "inverted", "elsewhere")
 
 SETTLED_SHARE = 0.1
 SETTLED_M = 0.02
-"""Error below which an estimate has always settled [m]; otherwise it has settled below a tenth of its initial error."""
+"""Error below which an estimate counts as settled [m]. It also counts as settled below a tenth of its initial error."""
 
 CONVERGED_M = 0.1
 """Largest error of a converged run's ICRs [m]: all three, averaged over the last tenth of the run."""
@@ -68,8 +68,8 @@ class Scenario:
     config : its filter section is used, and its robot for the start of preset ``field``
     inflate : inflate the ICR covariance at the drive's ICR changes (Section 5.2)
     guard : sign guard, of `icrtool.kernels.filter_records`, with the Euler steps of Eq. 14; None: as in the preset
-    model_icr_std_m : the truth obeys the filter's model, Eq. 14 with process noise drawn from Q (Eq. 30), from ICRs
-        drawn with this standard deviation on; None: constant ICRs and exact kinematics
+    model_icr_std_m : standard deviation of the true ICRs at the start [m]. The truth then obeys the filter's model:
+        Eq. 14 with process noise drawn from Q (Eq. 30). None: constant ICRs and exact kinematics
     """
 
     plan: DrivePlan
@@ -121,13 +121,13 @@ def run_scenarios(
 
     Parameters
     ----------
-    seed : run i of every scenario draws from the generator seeded (seed, i): scenarios differ by their setting alone,
-        and a run does not depend on how many there are or on the number of cores
+    seed : run i of every scenario draws from the generator with the seed (seed, i). So scenarios differ by their
+        setting alone, and a run depends neither on the number of runs nor on the number of cores
     measures : functions that give the results to keep of a run
 
     Returns
     -------
-    list with one element a scenario: the columns of `measures`, (runs, ...)
+    list with one element per scenario: the columns of `measures`, (runs, ...)
     """
     for scenario in scenarios:
         drives.check_drive(scenario.plan, scenario.sensors)
@@ -265,7 +265,7 @@ def _mean_nis(run: StudyRun) -> Found:
 
 
 def measure_times(run: StudyRun, since_s: float = 0.0, until_s: float = np.inf) -> Found:
-    """Return convergence and settling times [s] of every ICR after `since_s`; NaN: not before `until_s`."""
+    """Return convergence and settling times [s] of every ICR after `since_s`; NaN where `until_s` comes first."""
     begin = max(int(np.searchsorted(run.t_s, since_s - 1e-9)) - 1, 0)
     end = int(np.searchsorted(run.t_s, until_s - 1e-9))
     t = run.t_s[begin:end] - max(since_s, run.t_s[0])
@@ -315,7 +315,7 @@ def convergence_time(t: Floats, value: Floats, target: float) -> float:
 
 
 def settling_time(t: Floats, value: Floats, target: float) -> float:
-    """Return the time [s] from which on the value (k,) stays near the target (`SETTLED_SHARE`); NaN: it does not."""
+    """Return the time [s] from which on the value (k,) stays near the target (`SETTLED_SHARE`); else NaN."""
     near = max(SETTLED_SHARE * abs(target - float(value[0])), SETTLED_M)
     away = np.flatnonzero(~(np.abs(value - target) <= near))
     settled = int(away[-1]) + 1 if len(away) else 0

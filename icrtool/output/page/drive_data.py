@@ -47,7 +47,7 @@ from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, Run, track_of, 
 from icrtool.records.run_document import IcrColumn
 
 MOST_PAGE_STEPS = 150_000
-"""Largest number of wheel samples of a page. If there are more, a fixed number of samples is joined to one."""
+"""Largest number of wheel samples of a page. If there are more, each fixed number of samples is joined to one."""
 
 PATH_POINTS = 200_000
 """Largest number of points of all models' paths together. If there are more, the paths are thinned evenly."""
@@ -76,7 +76,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
     north, east = float(table.north_m[0]), float(table.east_m[0])
     origin = (float(round(north)), float(round(east))) if coordinates else (north, east)
     half = None if run.track_width_m is None else run.track_width_m / 2
-    # Numbers of each ICR as in its figure, and the ICRs without slip.
+    # The scale covers the same numbers of each ICR as its figure, and the ICRs without slip.
     shown = [] if half is None else [half, -half]
     for icr in (getattr(table, name) for name in ICR_COLUMNS):
         shown += [*percentiles(icr, RANGE_PERCENT), float(icr[0]), float(icr[-1])]
@@ -187,7 +187,7 @@ Paths = Iterator[tuple[str, tuple[Floats, Complexes]]]
 def _models_data(
     run: Run, report: DropoutDocument, steps: Ints, joined: int, origin: tuple[float, float]
 ) -> dict[str, object]:
-    """Return the models of the report, with the path of each model of constant parameters from the drive's begin.
+    """Return the models of the report, and the path of each model with constant parameters from the drive's start.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def _models_data(
 
 
 def _odometry(run: Run, every: int, origin: tuple[float, float]) -> Paths:
-    """Yield the paths of the rows of constant ICRs."""
+    """Yield the path of each row with constant ICRs."""
     for model in models_of(run):
         if len(model.icrs.x_icr) > 1:
             continue
@@ -229,7 +229,7 @@ def _odometry(run: Run, every: int, origin: tuple[float, float]) -> Paths:
 
 
 def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Paths:
-    """Yield the path of each held-out model of the report, here as fitted to the whole drive."""
+    """Yield the path of each held-out model of the report, with its parameters fitted to the whole drive."""
     ladder = report.ladder
     if ladder.fits is UNSET:
         return

@@ -102,11 +102,11 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     ----------
     run, coordinates : as in `write_page`
     report : what report.json holds
-    pictures : by name; pictures that the page shows where no script draws
+    pictures : pictures by name; the page shows them where no script draws
     """
     summary, stated = run.document, report
     if not coordinates:
-        # Coordinates relative to a datum that is left out show no place.
+        # Without the datum, coordinates relative to it do not show the place.
         metric = summary.gnss.datum is None
         pictures = {name: one for name, one in pictures.items() if not (metric and one.with_place)}
         summary, stated = without_place(run, report)
@@ -388,7 +388,7 @@ def _folded_columns(logs: Sequence[FleetLog]) -> list[str]:
 
     Notes
     -----
-    What is left has a place on a screen of 1280 pixels.
+    The other columns fit on a screen of 1280 pixels.
     """
     names = {name.partition("_p95_")[0] for log in logs for name in log.errors}
     kept = (CONTROLLER, MOST_USEFUL if MOST_USEFUL in names else WITHOUT_IT, "no_slip")
@@ -455,7 +455,7 @@ def comparison_page(found: GroupComparison, title: str) -> str:
 
 
 def comparison_in(place: Path) -> Path | None:
-    """Return the file of a comparison: `place` itself, or the one in that folder; None where there is none."""
+    """Return the file of a comparison: `place` itself, or the first one in this folder; None where there is none."""
     inside = place if place.is_dir() else None
     files = [place] if inside is None else sorted(place.glob("*.json"))
     return next((file for file in files if schema_of(file, inside).startswith(COMPARISON_FAMILY)), None)

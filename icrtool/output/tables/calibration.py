@@ -110,7 +110,7 @@ def _log_constants(log: documents.CalibrationLog) -> tuple[str, str]:
 
 
 def sensor_tables(calibration: Calibration) -> list[Block]:
-    """Return the table of the sensors' constants that a calibration holds in a further drive; none of an old file."""
+    """Return a table of the sensors' constants that a calibration uses in a further drive; none for an old file."""
     known = constants_document(pooled_constants(calibration.logs, with_gyro=calibration.gyro is not None))
     texts = [(words, constant_text(known, name)) for name, (words, *_) in CONSTANT_WORDS.items()]
     rows = [row for row in texts if row[1]]
@@ -143,7 +143,7 @@ def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) 
 
 
 def _left_out_table(found: Calibration) -> Table:
-    """Return p95 and expected error by horizon of each log or block, predicted without itself."""
+    """Return p95 and expected error by horizon of each log or block, predicted by a fit without it."""
     horizons = sorted({one.horizon_m for one in found.held_out_pooled})
     each = {(one.log, one.horizon_m): one for one in found.held_out if one.model == MOST_USEFUL}
     names = dict.fromkeys(one.log for one in found.held_out)
@@ -303,7 +303,7 @@ def forecast_blocks(
 
 
 def transfer_csv(found: documents.GroupComparison) -> bytes:
-    """Return the transfer matrix as CSV, a row and column of it and a horizon each."""
+    """Return the transfer matrix as CSV: one line for each element and horizon."""
     columns = ("calibrated_on", "tested_on", "horizon_m", "trials", *documents.ErrorsAt.__struct_fields__[1:])
     return csv_bytes(columns, ([getattr(cell, name) for name in columns] for cell in found.transfer))
 
@@ -363,8 +363,8 @@ def change_of(pair: documents.ComparedPair, found: documents.GroupComparison) ->
 
     Notes
     -----
-    A change is seen where its 95 % interval does not hold zero. A true change of half the interval is seen in one
-    comparison of two; one of `SEEN_HALF_WIDTHS` of it in four of five (power of a normal test).
+    A change is seen where its 95 % interval does not contain zero. A true change of one half width of the interval is
+    seen in one of two comparisons, a change of `SEEN_HALF_WIDTHS` half widths in four of five (power of a normal test).
     """
     drives = sum(len(found.groups[name].logs) for name in (pair.first, pair.second))
     of_drives = f"with these {counted(drives, 'drive')}"
@@ -400,7 +400,7 @@ def _capital(text: str) -> str:
 
 
 SEEN_HALF_WIDTHS = (1.96 + 0.84) / 1.96
-"""A change of so many half widths of a 95 % interval is seen in 80 % of comparisons: quantiles of 97.5 and 80 %."""
+"""Change that is seen in 80 % of comparisons, in half widths of a 95 % interval: from quantiles of 97.5 and 80 %."""
 
 
 QUANTITY_WORDS = {

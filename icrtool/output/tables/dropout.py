@@ -64,7 +64,7 @@ NEXT_DRIVE_MEANS = "next drive: this robot, this kind of ground"
 
 
 def format_dropout(report: DropoutReport) -> str:
-    """Return all that is printed of a report, no line end."""
+    """Return the text that is printed of a report, without the last line end."""
     return format_blocks(dropout_blocks(report))
 
 
@@ -83,7 +83,7 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     report : content of report.json; null for a number that is not known
     """
     summary = with_verdict(summary, report)
-    # How many trials the first row rests on, at the horizon nearest to `CHOICE_HORIZON_M` that has any.
+    # Number of trials of the first row, at the horizon with trials that is nearest to `CHOICE_HORIZON_M`.
     counts = zip(report.trials, trials_of_first(report), strict=True)
     row, count = min(counts, key=lambda one: (not one[1], abs(one[0].horizon_m - CHOICE_HORIZON_M)))
     trials = f"{distance_text(report.run.drive.distance_m)}, {count:,} trials of {row.horizon_m:g} m"
@@ -124,7 +124,7 @@ def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Secti
 
 
 def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[list[ReachRow], list[ReachRow]]:
-    """Return name, distance on this drive, on the next one, and note of each row: those that are shown first, others.
+    """Return the rows that are shown first, and the others: name, distance on this and on the next drive, and note.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
 
 
 def heading_lines(report: DropoutDocument) -> Iterator[str]:
-    """Yield that the heading at the start makes most of the error of the best row, and what mends it."""
+    """Yield a line with the remedy if the heading at the start makes most of the error of the best row."""
     found = UNSET if report.best is None else report.best.start_heading
     if report.best is not None and found is not UNSET and found.dominates:
         whole = f"{error_text(found.p95_m)} after {report.best.horizon_m:g} m (95 %)"
@@ -209,7 +209,7 @@ def heading_lines(report: DropoutDocument) -> Iterator[str]:
 
 
 def sensor_lines(report: DropoutDocument) -> Iterator[str]:
-    """Yield which sensors' constants of a calibration the log contradicts."""
+    """Yield a line for each constant of a calibration's sensors that the log contradicts."""
     return (one.sentence for one in report.notes if one.code == SENSORS_CONTRADICT)
 
 
