@@ -67,8 +67,8 @@ SMOOTH_S = 0.2
 """Half the time over which the heading is averaged for the sideways motion [s]. Its noise would reduce this motion."""
 
 OVERLAP = 1.0
-"""Overlap of the windows that the covariance assumes: none, because their ends are different fixes. The spread between
-groups of windows shows common errors."""
+"""Number of residuals that count as one independent residual: each, because their windows end at different fixes.
+The spread between groups of windows shows common errors."""
 
 RESPONSE_STD_S = RESPONSE_S / math.sqrt(12.0)
 """Standard deviation of a robot's response to its wheels [s]. No drive separates it from a delay of the streams."""

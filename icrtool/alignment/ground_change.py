@@ -135,7 +135,7 @@ def _turns(fit: AlignmentFit) -> _Turns | None:
 
 
 def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list[float]]:
-    """Return for 0, 1, ... changes the rows that divide the windows, both ends included, and the sum of squares left.
+    """Return for 0, 1, ... changes the rows that divide the windows, with both ends, and the sum of squares left over.
 
     Parameters
     ----------
@@ -145,17 +145,17 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
     groups = np.searchsorted(np.unique(turns.group), turns.group)
     enough = np.append(groups, groups[-1] + 1)[places]
 
-    def left(first: Ints, stop: int) -> Floats:
+    def remaining(first: Ints, stop: int) -> Floats:
         xx, xy, yy = (total[stop] - total[first] for total in sums)
         short = (enough[stop] - enough[first] < FEWEST_CHANGE_GROUPS) | (xx <= 0.0)
         return np.where(short, np.inf, np.maximum(yy - xy**2 / np.where(xx > 0.0, xx, 1.0), 0.0))
 
     count = len(places)
-    best = np.array([np.inf, *(float(left(np.array([0]), stop)[0]) for stop in range(1, count))])
+    best = np.array([np.inf, *(float(remaining(np.array([0]), stop)[0]) for stop in range(1, count))])
     came, ways, costs = list[Ints](), list[list[int]](), list[float]()
     for changes in range(MOST_CHANGES + 1):
         if changes:
-            by_first = [best[:stop] + left(np.arange(stop), stop) for stop in range(1, count)]
+            by_first = [best[:stop] + remaining(np.arange(stop), stop) for stop in range(1, count)]
             came.append(np.array([0, *(int(np.argmin(one)) for one in by_first)]))
             best = np.array([np.inf, *(float(one.min()) for one in by_first)])
         if not math.isfinite(best[-1]):
@@ -173,7 +173,7 @@ def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
     """Return rows that divide the windows, each moved to the smallest sum of squares between its neighbours."""
     xx, xy, yy = (np.append(0.0, np.cumsum(one)) for one in (turns.x**2, turns.x * turns.y, turns.y**2))
 
-    def left(first: Ints | int, stop: Ints | int) -> Floats:
+    def remaining(first: Ints | int, stop: Ints | int) -> Floats:
         square = np.maximum(xx[stop] - xx[first], 1e-12)
         return np.asarray(yy[stop] - yy[first] - (xy[stop] - xy[first]) ** 2 / square)
 
@@ -181,7 +181,7 @@ def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
     for i in range(1, len(rows) - 1):
         at = int(np.searchsorted(places, rows[i]))
         tried = np.arange(max(int(places[at - 1]), found[i - 1]) + 1, min(int(places[at + 1]), rows[i + 1]))
-        found[i] = int(tried[np.argmin(left(found[i - 1], tried) + left(tried, rows[i + 1]))])
+        found[i] = int(tried[np.argmin(remaining(found[i - 1], tried) + remaining(tried, rows[i + 1]))])
     return found
 
 

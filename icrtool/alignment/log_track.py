@@ -24,6 +24,8 @@ from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 
 ALIGNMENT_WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
+"""Usual and largest length of the windows of the alignment [m]."""
+
 WINDOW_IN_WIDTHS = 4.0
 """Length of the windows of small robots, in track widths. Slip is a share of the distance; over 2 m it hides their
 ICRs."""
@@ -37,6 +39,8 @@ WINDOW_IN_VALUES = 12.0
 accelerates moves the end of a window by a part of this distance."""
 
 STARTS_A_WINDOW, FEWEST_ALIGNMENT_WINDOWS = 8, 8
+"""Number of windows that start within the length of one window, and smallest number of windows for a fit."""
+
 FEWEST_OVERLAPPING = 2 * STARTS_A_WINDOW
 """Smallest number of overlapping windows that are used: as many as start within two windows."""
 

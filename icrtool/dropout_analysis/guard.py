@@ -10,7 +10,7 @@ from icrtool.dropout_analysis.report import OpenLoopErrors
 from icrtool.motion.recording import LONGEST_RECORDING_STEP_S, MOST_TRIALS
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.notes import Note, note
-from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT
+from icrtool.records.rows import FALLBACK_ROW, MAIN_ROW
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.run_document import RunDocument
 
@@ -56,11 +56,11 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
         of_icr = f"where icr has {errors.counts.trials[h]:,}"
         return note("few_trials", f"{rests}, {of_icr}: are the stamps of the wheels regular?")
     hidden = [ICR_WORDS[column] for column in ICR_COLUMNS[:2] if summary.icr_of_drive(column) is None]
-    icr, recommended = (rows[name][h].p95_m if name in rows else None for name in (WITHOUT_IT, MOST_USEFUL))
+    icr, recommended = (rows[name][h].p95_m if name in rows else None for name in (FALLBACK_ROW, MAIN_ROW))
     if not hidden or icr is None or recommended is None:
         return None
     if max(icr, recommended) <= LARGEST_ROW_RATIO * min(icr, recommended):
         return None
-    apart = f"{WITHOUT_IT} errs by {icr:.3g} m and {MOST_USEFUL} by {recommended:.3g} m after {horizon} (95 %)"
+    apart = f"{FALLBACK_ROW} errs by {icr:.3g} m and {MAIN_ROW} by {recommended:.3g} m after {horizon} (95 %)"
     text = f"the drive does not show {' and '.join(hidden)}, and {apart}: wheels and fixes contradict each other"
     return note("rows_contradict", text)

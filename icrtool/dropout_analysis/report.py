@@ -403,7 +403,7 @@ def best_row(
     return documents.BestRow(best, float(errors.horizons_m[h]), least, tuple(as_good), heading)
 
 
-HALF_OF_SQUARE = math.sqrt(0.5)
+ROOT_HALF = math.sqrt(0.5)
 """Ratio of two errors if the square of the first is half of the square of the second.
 
 Squares are compared because independent parts of an error add in squares."""
@@ -423,8 +423,8 @@ def start_heading(result: documents.ModelResult, h: int, source: str) -> documen
     if aligned is None:
         return UNSET
     expected, p95 = (float(result.column(name)[h]) for name in ("expected_error_m", "p95_m"))
-    half = difference_half_width(aligned.sums, result.block_sums[h], "p95", HALF_OF_SQUARE, paired=True)
-    dominates = aligned.p95_m - HALF_OF_SQUARE * p95 + half < 0.0
+    half = difference_half_width(aligned.sums, result.block_sums[h], "p95", ROOT_HALF, paired=True)
+    dominates = aligned.p95_m - ROOT_HALF * p95 + half < 0.0
     mend = "check the heading sensor's mounting and calibration"
     if source in ESTIMATED_HEADINGS:
         mend = "mount an AHRS or a second antenna"

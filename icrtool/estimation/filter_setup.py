@@ -49,9 +49,9 @@ too near to 0, and without this limit 0.11 m. It costs robots of 0.2 m nothing.
 FARTHEST_START_M, LARGEST_START_STD_M = 1000.0, 10_000.0
 """Largest distance of an ICR and largest standard deviation in a warm start [m], as for a configured start."""
 
-GAP_SPEED_STD_MPS = 2.0
-GAP_TURN_STD_RADPS = 1.0
-"""Standard deviation of the pose's motion [m] and turn [rad] in the first second of a gap in the wheel data."""
+GAP_MOVE_STD, GAP_TURN_STD = 2.0, 1.0
+"""Standard deviation of the position [m/√s] and of the heading [rad/√s] in a gap in the wheel data: both variances grow
+in proportion to time."""
 
 WHEEL_GAP_IN_INTERVALS = 2.5
 """Smallest ratio of a gap to the usual interval between wheel samples, for slow streams."""
@@ -63,9 +63,9 @@ Section 2), but an antenna off centre may shift them."""
 EVENT_MARGIN_S = 0.2
 """Time by which slip events are extended on both sides [s], because begin and end are uncertain by this time."""
 
-RECOVERY_COUNT = 10
-RECOVERY_S = 1.0
-"""Time for which rejected measurements must agree with each other to be accepted again [s]."""
+RECOVERY_COUNT, RECOVERY_S = 10, 1.0
+"""Number of rejected measurements, and time [s] between the first and the last one, that must agree with each other
+before measurements are accepted again."""
 
 TURN_WANDER_RAD = math.radians(1.2)
 """Random walk of the difference between a body's turn and its wheels' turn [rad/sqrt(s)]. Errors of an attitude sensor
@@ -204,7 +204,7 @@ def _without_lost_headings(data: FilterInputs, config: Config, antenna_m: tuple[
         end = data.wheel_t[row + 1]
         after = int(np.searchsorted(data.heading_t, end))
         seen = max(data.wheel_t[row], data.heading_t[after - 1]) if after else data.wheel_t[row]
-        if GAP_TURN_STD_RADPS * math.sqrt(end - seen) <= LOST_RAD or after == len(data.heading_t):
+        if GAP_TURN_STD * math.sqrt(end - seen) <= LOST_RAD or after == len(data.heading_t):
             continue
         until = data.heading_t[after]
         # a sample is held until the next one: the heading is unknown in all of these
@@ -366,8 +366,8 @@ def _parameters(config: Config, data: FilterInputs, sensors: SensorData, noise: 
         antenna_forward=sensors.facts.antenna_m[0] if rules.corrects else 0.0,
         antenna_right=sensors.facts.antenna_m[1] if rules.corrects else 0.0,
         wheel_gap_s=wheel_gap_s(config, data.wheel_t) if rules.corrects else math.inf,
-        gap_speed_variance=GAP_SPEED_STD_MPS**2,
-        gap_turn_variance=GAP_TURN_STD_RADPS**2,
+        gap_speed_variance=GAP_MOVE_STD**2,
+        gap_turn_variance=GAP_TURN_STD**2,
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
         icr_inflation_m2=(settings.terrain_icr_std_m or rules.terrain_icr_std_m or width_m) ** 2,

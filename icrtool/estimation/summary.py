@@ -86,7 +86,7 @@ def summarise(
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
-    covariance, excitation, x_clock_std_m = learned(filtered, config, sensors.facts.clock_std_s)
+    covariance, excitation, x_clock_std_m = assess_icrs(filtered, config, sensors.facts.clock_std_s)
     multiplier = None if width is None else (separation_multiplier(table, width), multiplier_std(covariance, width))
     inverted = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1])
     rules = config.filter.rules
@@ -221,7 +221,9 @@ def _spans(stamps_ns: Ints) -> Spans:
     return tuple((int(begin), int(end)) for begin, end in stamps_ns)
 
 
-def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, ExcitationDocument, float]:
+def assess_icrs(
+    filtered: Filtered, config: Config, clock_std_s: float = 0.0
+) -> tuple[Floats, ExcitationDocument, float]:
     """Return the covariance (3, 3) of the final ICRs [m^2], what was shown, and the clocks' part of x_icr's std [m].
 
     Parameters

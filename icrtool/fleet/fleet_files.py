@@ -28,7 +28,7 @@ from icrtool.records import fleet_document as documents
 from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog
 from icrtool.records.places import is_regular
 from icrtool.records.process_resources import remove
-from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT
+from icrtool.records.rows import FALLBACK_ROW, MAIN_ROW
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.text import LogText, counted, escaped
 
@@ -55,7 +55,7 @@ FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", FLEET_FILE)
 
-SHOWN_ERRORS = {MOST_USEFUL: documents.SHOWN_ERROR, WITHOUT_IT: documents.SHOWN_WITHOUT}
+SHOWN_ERRORS = {MAIN_ROW: documents.SHOWN_ERROR, FALLBACK_ROW: documents.SHOWN_FALLBACK}
 """Rows whose errors the picture may show, and their columns; it shows the first row that any log has."""
 
 
@@ -187,7 +187,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
     points: list[FleetLog] = []
     errors: dict[str, dict[str, float]] = {}
     known = {name for row in rows for name in row.errors}
-    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", documents.SHOWN_WITHOUT))
+    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", documents.SHOWN_FALLBACK))
     for row in sorted(rows, key=lambda row: row.start_utc):
         shown = all(row.icr.get(name) is not None for name in ("y_icr_right_m", "y_icr_left_m"))
         if shown and row.start_utc:

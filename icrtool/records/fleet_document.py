@@ -9,7 +9,7 @@ from msgspec import UNSET, UnsetType, field
 from icrtool.records.acceptance import Verdict
 from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
-from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT
+from icrtool.records.rows import FALLBACK_ROW, MAIN_ROW
 
 FLEET_SCHEMA: Literal["icrtool/fleet/1"] = "icrtool/fleet/1"
 """Version of what fleet.json holds."""
@@ -26,7 +26,7 @@ RUNS, ROWS = "runs", ".rows"
 BUDGET_M = 0.5
 """Position error that defines the distance stated for a calibration [m]."""
 
-SHOWN_ERROR, SHOWN_WITHOUT = f"{MOST_USEFUL}_p95_10m_m", f"{WITHOUT_IT}_p95_10m_m"
+SHOWN_ERROR, SHOWN_FALLBACK = f"{MAIN_ROW}_p95_10m_m", f"{FALLBACK_ROW}_p95_10m_m"
 """The error of each log that is printed, drawn and compared with the baseline; the second where no held-out error
 exists."""
 
@@ -142,7 +142,7 @@ class FleetLog(Record, frozen=True):
     def shown_error(self, *, baseline: bool = False) -> float | None:
         """Return the error [m] that stands for the log, or for its baseline."""
         errors = self.baseline if baseline else self.errors
-        return errors.get(SHOWN_ERROR if SHOWN_ERROR in self.errors else SHOWN_WITHOUT)
+        return errors.get(SHOWN_ERROR if SHOWN_ERROR in self.errors else SHOWN_FALLBACK)
 
     @property
     def gates_failed(self) -> int:

@@ -127,7 +127,7 @@ REPORT_ROWS: dict[str, Row] = {
 """The rows by name, in the order in which they are shown. ``calibration:STEM`` is a row of kind ``calibration``,
 ``topic:/its/name`` a row of kind ``topic``."""
 
-MOST_USEFUL, WITHOUT_IT = "recommended", "icr"
+MAIN_ROW, FALLBACK_ROW = "recommended", "icr"
 """The row that stands for a log, and the row in its place where a report has no held-out rows."""
 
 LONGEST_ROW_NAME = 28
@@ -198,8 +198,8 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def shown_rows(names: Sequence[str]) -> list[str]:
-    """Return the names of the rows that are shown first, in order: `WITHOUT_IT` too where `MOST_USEFUL` is missing."""
-    instead = () if MOST_USEFUL in names else (WITHOUT_IT,)
+    """Return the names of the rows that are shown first, in order: `FALLBACK_ROW` too where `MAIN_ROW` is missing."""
+    instead = () if MAIN_ROW in names else (FALLBACK_ROW,)
     return [name for name, row in rows_of(names).items() if row.shown or name in instead]
 
 

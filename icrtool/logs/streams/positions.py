@@ -72,7 +72,7 @@ REFERENCE_FRAMES = {"world", "earth", "ecef", "local_enu", "enu", "camera_init"}
 GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
 GOAL = "its name is the name of a goal, not of a measurement"
 
-LEAST_AREA_M = 1.0
+LEAST_DRIVE_WIDTH_M = 1.0
 """Least width of a drive that shows in which plane it lies: a standard deviation of its positions [m]."""
 
 FLAT_RATIO = 0.1
@@ -271,7 +271,7 @@ def _is_level(places_m: Floats) -> bool:
     kept = np.clip(some, *np.percentile(some, [2.5, 97.5], axis=0))
     _, size, axes = np.linalg.svd(kept - kept.mean(axis=0), full_matrices=False)
     _, across_m, off_m = size / math.sqrt(len(some))
-    return bool(across_m < LEAST_AREA_M or off_m > FLAT_RATIO * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
+    return bool(across_m < LEAST_DRIVE_WIDTH_M or off_m > FLAT_RATIO * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
 
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")

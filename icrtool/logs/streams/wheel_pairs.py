@@ -370,9 +370,9 @@ def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, In
     stamps = replace(rows[0], set_back=max(one.set_back for one in rows), clock_set=clock_set)
     if len(headers) == 2:
         return stamps, spread_bursts(headers[0]).stamp_ns, spread_bursts(headers[1]).stamp_ns
-    note = rows[0].note or rows[1].note or "the header stamps of a side go back"
+    why = rows[0].note or rows[1].note or "the header stamps of a side go back"
     far = rows[0].far_ns if share_clock(rows) else None
-    stamps = replace(stamps, header_ns=None, note=note, delay_ns=0, replaced=0, far_ns=far)
+    stamps = replace(stamps, header_ns=None, note=why, delay_ns=0, replaced=0, far_ns=far)
     return stamps, spread_bursts(rows[0].log_ns).stamp_ns, spread_bursts(rows[1].log_ns).stamp_ns
 
 

@@ -59,7 +59,7 @@ from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
 from icrtool.records.notes import is_grave, warnings_of
 from icrtool.records.places import is_regular
-from icrtool.records.rows import IN_CSV, MOST_USEFUL, WITHOUT_IT, rows_of, shown_rows
+from icrtool.records.rows import FALLBACK_ROW, IN_CSV, MAIN_ROW, rows_of, shown_rows
 from icrtool.records.run import ICR_WORDS, Run, check_type
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text
@@ -391,7 +391,7 @@ def _folded_columns(logs: Sequence[FleetLog]) -> list[str]:
     The other columns fit on a screen of 1280 pixels.
     """
     names = {name.partition("_p95_")[0] for log in logs for name in log.errors}
-    kept = (CONTROLLER, MOST_USEFUL if MOST_USEFUL in names else WITHOUT_IT, "no_slip")
+    kept = (CONTROLLER, MAIN_ROW if MAIN_ROW in names else FALLBACK_ROW, "no_slip")
     further = [_error_column(model) for model in IN_CSV if model not in kept]
     limits = [] if any(log.gates_failed for log in logs) else ["limits not met"]
     return [*further, *(f"ICR {word}" for word in ICR_WORDS.values()), "events", *limits]

@@ -32,7 +32,7 @@ from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.fleet_document import BUDGET_M
 from icrtool.records.plain_data import known
-from icrtool.records.rows import MOST_USEFUL, in_order, shown_rows
+from icrtool.records.rows import MAIN_ROW, in_order, shown_rows
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.text import counted, distance_text, with_interval, with_std
 
@@ -127,9 +127,9 @@ def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) 
     ]
     head = ("95 % / expected [m]", *(f"{horizon:g} m" for horizon in horizons))
     lead, text = "not known", "no distance was left out"
-    if (own := pooled.get((MOST_USEFUL, CHOICE_HORIZON_M))) is not None:
+    if (own := pooled.get((MAIN_ROW, CHOICE_HORIZON_M))) is not None:
         lead = error_text(own.p95_m)
-        text = f"after {CHOICE_HORIZON_M:g} m (95 %) with {MOST_USEFUL}, on distance that was not fitted"
+        text = f"after {CHOICE_HORIZON_M:g} m (95 %) with {MAIN_ROW}, on distance that was not fitted"
     numbers = blocks_of_numbers(found.controller, found.width_m, icrs)
     if alone := controller_error_text(found.controller_errors):
         numbers.append(alone)
@@ -145,10 +145,10 @@ def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) 
 def _left_out_table(found: Calibration) -> Table:
     """Return p95 and expected error by horizon of each log or block, predicted by a fit without it."""
     horizons = sorted({one.horizon_m for one in found.held_out_pooled})
-    each = {(one.log, one.horizon_m): one for one in found.held_out if one.model == MOST_USEFUL}
+    each = {(one.log, one.horizon_m): one for one in found.held_out if one.model == MAIN_ROW}
     names = dict.fromkeys(one.log for one in found.held_out)
     rows = [(name, *(_errors_text(each.get((name, horizon))) for horizon in horizons)) for name in names]
-    caption = f"95 % / expected error [m] of {MOST_USEFUL}, each log or block of distance predicted without itself"
+    caption = f"95 % / expected error [m] of {MAIN_ROW}, each log or block of distance predicted without itself"
     return Table("lr", rows, ("left out", *(f"{horizon:g} m" for horizon in horizons)), caption)
 
 

@@ -44,10 +44,10 @@ from icrtool.records.acceptance import CHOICE_HORIZON_M, NEAR_HORIZONS_M, Budget
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
 from icrtool.records.notes import is_grave
 from icrtool.records.rows import (
+    FALLBACK_ROW,
     LONGEST_ROW_NAME,
-    MOST_USEFUL,
+    MAIN_ROW,
     TOPIC_ROW,
-    WITHOUT_IT,
     in_order,
     kind_of,
     row_of,
@@ -131,7 +131,7 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
     events : slip events of the run; the last row is the distance without them, where that is known
     """
     by_model = {one.model: one for one in report.budgets if one.budget_m == budget_m}
-    best = report.best.model if report.best is not None else MOST_USEFUL
+    best = report.best.model if report.best is not None else MAIN_ROW
     order = in_order(by_model)
     first = sorted(shown_rows(order), key=lambda name: name != best)
     notes = {one.name: one.fitted for one in report.calibrations}
@@ -142,7 +142,7 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
     rows = [reach_row(by_model[name], notes.get(name, "")) for name in first]
     if report.run.config.robot.track_width_m is None:
         rows.append(("no_slip", "not known", "", "needs --robot"))
-    leading = by_model.get(best) or by_model.get(WITHOUT_IT)
+    leading = by_model.get(best) or by_model.get(FALLBACK_ROW)
     if events and leading is not None and (quiet := leading.without_events_text):
         rows.append((f"without its {counted(events, 'slip event')}", quiet, "", leading.model))
     return rows, [reach_row(by_model[name]) for name in order if name not in first]

@@ -444,7 +444,7 @@ def test_a_name_of_megabytes_costs_no_time() -> None:
 
 @pytest.mark.parametrize("name", ["{:06d}" + 15_000 * "left", 15_000 * "right" + "{:06d}"])
 def test_another_name_of_60000_characters_in_each_message_costs_no_time(tmp_path: Path, name: str) -> None:
-    """By the rule of SECURITY.md: below 2 s of CPU, and 1 s for each 10 MB; before, this one took 77 s."""
+    """By the rule of SECURITY.md: below 2 s of CPU, and 1 s for each MB; before, this one took 77 s."""
     path = tmp_path / "log.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
