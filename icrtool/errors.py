@@ -48,7 +48,7 @@ class LogError(IcrToolError):
 
 
 class LogChangedError(LogError):
-    """A log that was written to while it was read."""
+    """A log, or another input of a batch, that was written to while it was used."""
 
 
 class DefinitionError(LogError):

@@ -88,10 +88,12 @@ def batch_command(
     \b
     Example:
       icrtool batch season/ -o results --robot husky-a200
+      icrtool batch season/ -o results --robot husky-a200 --calibration last-season.json
       icrtool batch logs.csv -o results -j 4 --gate "recommended.p95@10m <= 1.5"
     """  # noqa: D301 - click reads the escape
     asked = batch.report
     compared = options.baseline_of(batch.baseline, asked.gates)
+    options.calibrations_of(batch.calibrations, asked)
     with remote_place.on_disk(output, parts=fleet_files.FOLDERS) as folder:
         requests = batches.plan(places, output, batch, folder)
         folder.mkdir(parents=True, exist_ok=True)

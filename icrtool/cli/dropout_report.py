@@ -11,7 +11,7 @@ import click
 from icrtool.cli import options, when_used
 from icrtool.cli.fit import fitted_log
 from icrtool.cli.inputs import RUNS_FOLDER, ResultPlace, RunPlace, check_run_config, logs_of, run_directories
-from icrtool.cli.options import FILE, POSITIVE, Exports, choice, flag, option
+from icrtool.cli.options import POSITIVE, Exports, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.choices import Reference, Starts
 from icrtool.records.places import UrlPath
@@ -23,7 +23,7 @@ with when_used():
     from icrtool.logs.containers import recording_files
     from icrtool.output import run_directory, text_blocks
     from icrtool.output.exports import acceptance
-    from icrtool.output.files import formats, remote_place
+    from icrtool.output.files import remote_place
     from icrtool.output.tables import dropout
 
 if TYPE_CHECKING:
@@ -51,10 +51,6 @@ REPORT_OPTIONS = options.reporting(
     options.PLACES,
     option("--horizons horizons_m", "M,M,...", distances, "Distances without GNSS [m], in place of the configured "
            "ones."),
-    option("--calibration calibration_files", "CAL.json", FILE, "Also predict with a calibration that icrtool "
-           "calibrate wrote; repeatable.", multiple=True),
-    flag("--refit-sensors", "Refit heading offset, delays and gyro bias of the calibrations in this log, in place of "
-         "those that they hold."),
     option("--score", "TOPIC", None, "Also compare the poses of a topic with the reference, for example "
            "/odometry/filtered; needs the LOG, which is read again; repeatable.", multiple=True),
     option("--outage outage_s", "SECONDS", POSITIVE, "Force GNSS outages of this length, and report the error at their "
@@ -79,7 +75,7 @@ REPORT_OPTIONS = options.reporting(
 @options.INPUT_LIMITS
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def dropout_report_command(
-    sources: tuple[Path, ...], place: ResultPlace, calibration_files: tuple[Path, ...], report: ReportRequest,
+    sources: tuple[Path, ...], place: ResultPlace, calibrations: tuple[Path, ...], report: ReportRequest,
     files: ResultFiles, baseline: Path | None, exports: Exports, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Report how far off a robot is without GNSS: open loop from every recorded state, over 1 to 20 m.
@@ -94,12 +90,11 @@ def dropout_report_command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
-    if report.refit_sensors and not calibration_files:
-        raise click.UsageError("--refit-sensors refits the sensors of a calibration: name one with --calibration")
+    known = options.calibrations_of(calibrations, report)
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)
     report = report.configured(config)
-    given = Given(tuple(map(formats.open_calibration, calibration_files)), compared)
+    given = Given(known, compared)
     sources, places = plan_sources(sources, place, config, printer)
     if report.score and (runs := [source for source in sources if source not in places]):
         why = f"{escaped(str(runs[0]))} is a run, which holds no poses of other topics"

@@ -37,10 +37,11 @@ with when_used():
     from icrtool.records import input_limits, rows
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import Calibration
     from icrtool.config import ConfigSources
     from icrtool.records.acceptance import Verdict
     from icrtool.records.fleet_document import FleetVerdict
-    from icrtool.records.requests import FitRequest
+    from icrtool.records.requests import FitRequest, ReportRequest
 
 Command = Callable[..., Any]
 Option = Callable[[Command], Command]
@@ -356,6 +357,13 @@ BUDGETS = option(
     "--budget budgets_m", "METRES", POSITIVE, "Report how far 95 % of the errors stay within this; repeatable.",
     multiple=True, default=(0.5,),
 )  # fmt: skip
+CALIBRATION_OPTIONS = add_all(
+    option("--calibration calibrations", "CAL.json", FILE, "Also predict with a calibration that icrtool calibrate "
+           "wrote; repeatable.", multiple=True),
+    flag("--refit-sensors", "Refit heading offset, delays and gyro bias of the calibrations in this log, in place of "
+         "those that they hold."),
+)  # fmt: skip
+"""--calibration as `calibrations`, and --refit-sensors; `calibrations_of` reads the files."""
 ALLOW_UNUSABLE = flag("--allow-unusable", "Give distances and numbers of runs that are not usable, too.")
 
 
@@ -394,6 +402,7 @@ def reporting(*further: Option) -> Option:
         "report",
         f"{REQUESTS_MODULE}:ReportRequest",
         *further,
+        CALIBRATION_OPTIONS,
         BUDGETS,
         option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one a line: exit status 3 if one is not "
                "met; repeatable.", multiple=True, callback=_lines),
@@ -422,6 +431,13 @@ def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.B
         advice = "name it with --baseline REPORT.json|DIR"
         raise errors.ConfigError(f"gate {relative[0]!r}", "needs an earlier report", advice)
     return None
+
+
+def calibrations_of(files: Sequence[Path], request: ReportRequest) -> tuple[Calibration, ...]:
+    """Read the files of --calibration; refuse --refit-sensors where there is none."""
+    if request.refit_sensors and not files:
+        raise click.UsageError("--refit-sensors refits the sensors of a calibration: name one with --calibration")
+    return tuple(map(formats.open_calibration, files))
 
 
 def names_baseline(gate: str) -> bool:

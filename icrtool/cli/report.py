@@ -24,6 +24,7 @@ from icrtool.cli.inputs import (
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
+from icrtool.records.text import escaped
 
 with when_used():
     from icrtool import errors
@@ -46,12 +47,13 @@ if TYPE_CHECKING:
 @flag("--no-coordinates", "Leave out the place on the globe, for a page that others will read.")
 @option("--into", "DIR", FILE, "Folder of the run directories of logs; default: icrtool-runs.")
 @flag("--overwrite", "Also replace the run of another recording, or one that was made with other settings.")
+@options.together("report", f"{options.REQUESTS_MODULE}:ReportRequest", options.CALIBRATION_OPTIONS)
 @options.CONFIGURATION
 @options.INPUT_LIMITS
 @options.printing(options.QUIET, options.VERBOSE_OPTION)
 def report_command(
     sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, into: Path | None, overwrite: bool,
-    settings: ConfigSources, printer: Printer,
+    calibrations: tuple[Path, ...], report: requests.ReportRequest, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Answer the whole question of a LOG on one screen and one page; or write the page of a result.
 
@@ -63,16 +65,22 @@ def report_command(
     \b
     Example:
       icrtool report field.mcap --robot husky-a200
+      icrtool report field.mcap --robot husky-a200 --calibration season.json
       icrtool report icrtool-runs/field -o field.html --no-coordinates
       icrtool report results/
       icrtool report season.json
     """  # noqa: D301 - click reads the escape
+    given = dropout_report.Given(options.calibrations_of(calibrations, report), None)
     config = settings.load()
     sources = sources or (run_directory.newest_run(RUNS_FOLDER),)
     if output is not None and len(sources) > 1:
         advice = "leave it out: each page goes to its own directory"
         raise errors.ConfigError("-o", "names one file for several pages", advice)
     logs = tuple(source for source in sources if is_log(source))
+    if calibrations and (others := [source for source in sources if source not in logs]):
+        why = f"{escaped(str(others[0]))} is not a log, and its page shows the result that is there"
+        advice = "name the log; icrtool dropout-report RUN --calibration CAL.json makes the report of a run again"
+        raise errors.ConfigError("--calibration", why, advice)
     if not logs:
         check_run_config(config)
     places = dict(zip(logs, run_directories(logs, ResultPlace(into=into)), strict=True))
@@ -82,7 +90,7 @@ def report_command(
             result = source
             if source in places:
                 files = requests.ResultFiles(overwrite=overwrite, page=output is None and not no_coordinates)
-                _report_on_log(source, places[source], config, files, printer)
+                _report_on_log(source, places[source], config, report, files, given, printer)
                 if files.page:
                     continue
                 result = places[source].directory
@@ -91,11 +99,11 @@ def report_command(
 
 
 def _report_on_log(
-    source: Path, place: RunPlace, config: Config, files: requests.ResultFiles, printer: Printer
-) -> None:
+    source: Path, place: RunPlace, config: Config, report: requests.ReportRequest, files: requests.ResultFiles,
+    given: dropout_report.Given, printer: Printer,
+) -> None:  # fmt: skip
     """Print what a log shows, fitted unless its run is there, and write its run and report."""
-    request = requests.ReportRequest().configured(config)
-    given = dropout_report.Given((), None)
+    request = report.configured(config)
     there = run_directory.holds_run_of(place.directory, source, config, request.fit)
     if there:
         dropout_report.report_one(place.directory, None, config, request, files, given, printer)

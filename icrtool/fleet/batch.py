@@ -27,7 +27,7 @@ from icrtool.output.files.formats import CHECKSUM_FILE
 from icrtool.output.run_directory import PAGE_FILE, RUN_FILE
 from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
 from icrtool.records.places import UrlPath, read_regular
-from icrtool.records.requests import BatchRequest, LogRequest
+from icrtool.records.requests import BatchRequest, CalibrationInput, LogRequest
 
 if TYPE_CHECKING:
     from icrtool.output.dropout_directory import Baseline
@@ -78,6 +78,11 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
             raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")
         before = open_baseline(batch.baseline)
         baseline = before.digest
+    calibrations = tuple(
+        CalibrationInput(os.fsencode(file.absolute()), file_sha256(file)) for file in batch.calibrations
+    )
+    # The stem is in the name of the row.
+    named = [(as_text(file.stem), one.sha256) for file, one in zip(batch.calibrations, calibrations, strict=True)]
     requests = []
     for one in find_recordings(searched):
         known, settings = about_recording(one.path, entries), batch.settings
@@ -90,7 +95,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
         config = settings._replace(file=known.config or settings.file, robot=robot).load()
         # The key does not depend on whether a page is asked for: `finished` looks for the file report.html.
         files = replace(batch.files, page=True, overwrite=False)
-        asked = [config.effective(), __version__, batch.report, files, known.robot, baseline]
+        asked = [config.effective(), __version__, batch.report, files, known.robot, baseline, *named]
         row = FleetLog(
             one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot or config.robot.name or "", group=known.group,
             tags=known.tags, key=sha256(msgspec.json.encode(asked, order="sorted")).hexdigest(),
@@ -98,7 +103,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
         # Workers of a cluster may have another working directory.
         request = LogRequest(
             path=os.fsencode(one.path.absolute()), known=row, folder=os.fsencode(output.absolute()),
-            config=config, report=batch.report, files=batch.files,
+            config=config, report=batch.report, files=batch.files, calibrations=calibrations,
             baseline=os.fsencode(batch.baseline.absolute()) if batch.baseline is not None else b"",
         )  # fmt: skip
         requests.append(request)

@@ -22,12 +22,13 @@ from icrtool.pipeline import Stage, fit_into, report_into
 from icrtool.records.fleet_document import FleetFile, FleetLog, fleet_verdict
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import plain
-from icrtool.records.requests import LogRequest
+from icrtool.records.requests import CalibrationInput, LogRequest
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import Calibration
     from icrtool.records.dropout_document import ModelDocument
 
 FLEET_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
@@ -104,6 +105,7 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
 
     path, folder = path_of(request.path), path_of(request.folder)
     asked, files = request.report, request.files
+    calibrations = [_calibration_of(one) for one in request.calibrations]
     with fit_into(folder / request.known.run, path, request.config, asked.fit, files, stage, inside=folder) as found:
         run, partial = found
         before = None
@@ -112,7 +114,7 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
             before = open_baseline(path_of(request.baseline)).find(
                 known.log, run.document.content, known.robot, known.group
             )
-        report = report_into(partial, run, asked, files, stage, baseline=before)
+        report = report_into(partial, run, asked, files, stage, calibrations=calibrations, baseline=before)
     summary = run.document
     icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}
     controller = summary.controller
@@ -149,6 +151,24 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
         inputs=files_of(path, summary.inputs),
     )
+
+
+def _calibration_of(given: CalibrationInput) -> Calibration:
+    """Read a calibration file, whose digest is in the key of the row.
+
+    Raises
+    ------
+    OSError
+        It was removed.
+    LogChangedError
+        It is not as it was when the batch began.
+    """
+    from icrtool.output.files.formats import open_calibration
+
+    file = path_of(given.path)
+    if file_sha256(file) != given.sha256:
+        raise LogChangedError(file, "changed since the batch began", "run the batch again")
+    return open_calibration(file)
 
 
 def _errors(models: Iterable[ModelDocument]) -> dict[str, float | None]:

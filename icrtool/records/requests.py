@@ -123,6 +123,7 @@ class BatchRequest:
     report, files : of every log
     redo : logs that are done are processed again
     timeout_s : longest time of a log [s]; a longer process is ended
+    calibrations : files of calibrations, each of which becomes a row of every report
     baseline : earlier report, run or batch to compare with
     """
 
@@ -131,7 +132,15 @@ class BatchRequest:
     files: ResultFiles = field(default_factory=ResultFiles)
     redo: bool = False
     timeout_s: float = 1800.0
+    calibrations: tuple[Path, ...] = ()
     baseline: Path | None = None
+
+
+class CalibrationInput(Record, frozen=True):
+    """A calibration file of a batch: its path, and the SHA-256 of its content when the batch began."""
+
+    path: bytes
+    sha256: str
 
 
 class LogRequest(Record, frozen=True, kw_only=True):
@@ -142,6 +151,7 @@ class LogRequest(Record, frozen=True, kw_only=True):
     path : of the log
     known : the fields of its row that are known before the fit
     folder : of the batch
+    calibrations : each becomes a row of the report
     baseline : place of an earlier report or batch to compare with; empty: none
     """
 
@@ -151,6 +161,7 @@ class LogRequest(Record, frozen=True, kw_only=True):
     config: Config
     report: ReportRequest
     files: ResultFiles
+    calibrations: tuple[CalibrationInput, ...] = ()
     baseline: bytes = b""
 
     @property

@@ -21,7 +21,8 @@ from icrtool.records.calibration_document import (
 )
 from support.barn import configured, simulate
 
-MOWER = Path(__file__).resolve().parents[2] / "sample_logs" / "wheeled_lawnmower.mcap"
+SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
+MOWER, EIGHT = SAMPLES / "wheeled_lawnmower.mcap", SAMPLES / "wheeled_figure_eight"
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -140,6 +141,82 @@ def test_a_run_of_other_settings_is_lost_only_with_overwrite(icrtool: Command, r
     assert icrtool("fit", MOWER, "--robot", "segway-rmp400", *words)[0] == 0
     assert icrtool("fit", MOWER, "--overwrite", "--plots", "none", "-q")[0] == 0
     assert json.loads(file.read_bytes())["config"]["robot"]["name"] is None
+
+
+@pytest.fixture
+def eight(icrtool: Command, run_place: Path) -> Path:
+    """A calibration of another log than the one that is reported on."""
+    robot = ("--robot", "segway-rmp400")
+    assert icrtool("fit", EIGHT, *robot, "-o", "eight", "--plots", "none", "-q")[0] == 0
+    assert icrtool("calibrate", "eight", "-o", "eight.json", "-q")[0] == 0
+    return run_place / "eight.json"
+
+
+def calibration_rows(run: Path) -> list[dict[str, object]]:
+    """Return the rows of calibrations in a run's report, and how their sensors were found."""
+    document = json.loads((run / "dropout" / "report.json").read_text(encoding="utf-8"))
+    rows = [one for one in document["models"] if one["name"].startswith("calibration")]
+    return [*rows, *document["calibrations"]]
+
+
+@pytest.mark.parametrize("further", [(), ("--refit-sensors",)])
+def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_has(
+    icrtool: Command, run_place: Path, eight: Path, further: tuple[str, ...]
+) -> None:
+    asked = (MOWER, "--robot", "segway-rmp400", "--calibration", eight.name, *further)
+    assert icrtool("dropout-report", *asked, "--plots", "none", "-o", "expected", "-q")[0] == 0
+    expected = calibration_rows(run_place / "expected")
+    assert [one["name"] for one in expected if "by_horizon" in one][:1] == ["calibration"]
+    assert ("(--refit-sensors)" in str(expected)) == bool(further)
+
+    status, shown, errors = icrtool("report", *asked)
+    assert (status, errors) == (0, "")
+    run = run_place / "icrtool-runs" / MOWER.stem
+    assert calibration_rows(run) == expected
+    assert "calibration" in [line.split()[0] for line in shown.splitlines() if line.strip()]
+    assert "not fitted to this log" in spaced((run / "report.html").read_text(encoding="utf-8"))
+
+    status, shown, errors = icrtool("batch", *asked, "--plots", "none", "-o", "results", "-j", "1")
+    assert (status, errors) == (0, "")
+    assert calibration_rows(run_place / "results" / "runs" / MOWER.stem) == expected
+    assert "calibration_p95_10m_m" in (run_place / "results" / "fleet.csv").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("command", [("dropout-report",), ("report",), ("batch", "-o", "results")])
+@pytest.mark.parametrize(
+    ("content", "why"), [(None, "cannot be read"), ("{", "not a calibration"), ('{"schema": 1}', "not a calibration")]
+)
+def test_a_calibration_that_cannot_be_used_is_refused_before_any_log_is_read(
+    icrtool: Command, run_place: Path, command: tuple[str, ...], content: str | None, why: str
+) -> None:
+    if content is not None:
+        (run_place / "cal.json").write_text(content, encoding="utf-8")
+    before = sorted(run_place.iterdir())
+    status, shown, errors = icrtool(*command, MOWER, "--robot", "segway-rmp400", "--calibration", "cal.json")
+    assert (status, shown) == (1, "")
+    assert errors.startswith("Error: cal.json: ")
+    assert why in errors
+    assert sorted(run_place.iterdir()) == before
+
+
+@pytest.mark.parametrize("command", [("report",), ("batch", "-o", "results")])
+def test_sensors_are_refitted_only_for_a_calibration(
+    icrtool: Command, run_place: Path, command: tuple[str, ...]
+) -> None:
+    status, _, errors = icrtool(*command, MOWER, "--refit-sensors")
+    assert status == 2
+    assert "name one with --calibration" in errors
+    assert list(run_place.iterdir()) == []
+
+
+def test_a_calibration_is_refused_for_the_page_of_a_finished_run(
+    icrtool: Command, run_directory: Path, eight: Path
+) -> None:
+    status, _, errors = icrtool("report", run_directory, "--calibration", eight)
+    assert status == 1
+    assert "is not a log" in errors
+    assert "icrtool dropout-report RUN --calibration" in errors
+    assert not (run_directory / "report.html").exists()
 
 
 def test_a_calibration_has_a_page(icrtool: Command, run_directory: Path) -> None:

@@ -18,6 +18,7 @@ from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet import processes
 from icrtool.fleet.batch import finished, plan, run_batch
 from icrtool.fleet.fleet_files import write_fleet
+from icrtool.fleet.one_log import process
 from icrtool.fleet.processes import default_jobs
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.requests import BatchRequest, LogRequest, ReportRequest, ResultFiles
@@ -136,6 +137,45 @@ def test_what_is_done_is_skipped_until_input_configuration_or_request_change(sea
     assert run(season, sets=("filter.preset=paper",), redo=True)["b"].this_time == "processed"
     (season.parent / "out" / "runs" / "b" / "run.json").unlink()
     assert run(season, sets=("filter.preset=paper",))["b"].this_time == "processed"
+
+
+def test_the_content_and_name_of_a_calibration_and_the_refit_belong_to_what_is_done(season: Path) -> None:
+    add(season, "a")
+    first, second = season.parent / "first.json", season.parent / "second.json"
+    first.write_text("1")
+    assert run(season)["a"].this_time == "processed"
+    assert run(season, calibrations=(first,))["a"].this_time == "processed"
+    assert run(season, calibrations=(first,))["a"].this_time == "skipped"
+    refit = ReportRequest(refit_sensors=True)
+    assert run(season, calibrations=(first,), report=refit)["a"].this_time == "processed"
+    assert run(season, calibrations=(first,))["a"].this_time == "processed"
+    first.write_text("2")
+    assert run(season, calibrations=(first,))["a"].this_time == "processed"
+    # A row of the report has the name of the file.
+    first.rename(second)
+    assert run(season, calibrations=(second,))["a"].this_time == "processed"
+    (season.parent / "elsewhere").mkdir()
+    moved = second.rename(season.parent / "elsewhere" / second.name)
+    assert run(season, calibrations=(moved,))["a"].this_time == "skipped"
+    assert run(season, calibrations=(moved, moved))["a"].this_time == "processed"
+
+
+def test_a_calibration_that_changes_while_a_batch_runs_fails_the_log_until_the_next_batch(season: Path) -> None:
+    add(season, "a")
+    file = season.parent / "cal.json"
+    file.write_text("1")
+    (request,) = plan([season], season.parent / "out", BatchRequest(calibrations=(file,)))
+    reasons = {}
+    for content in ("2", None):
+        if content is None:
+            file.unlink()
+        else:
+            file.write_text(content)
+        row = process(request, lambda _: None)
+        assert (row.status, row.repeatable) == ("failed", False)
+        reasons[content] = row.reason
+    assert "cal.json: changed since the batch began" in reasons["2"]
+    assert "cal.json: No such file" in reasons[None]
 
 
 def test_another_version_processes_all_again(season: Path, monkeypatch: pytest.MonkeyPatch) -> None:

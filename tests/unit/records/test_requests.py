@@ -35,6 +35,7 @@ def arguments_of(*words: str) -> dict[str, Any]:
         (ResultFiles, ("fit", "log.bag")),
         (ReportRequest, ("dropout-report", "log.bag")),
         (ResultFiles, ("dropout-report", "log.bag")),
+        (ReportRequest, ("report", "log.bag")),
         (ReportRequest, ("batch", "season", "-o", "out")),
         (ResultFiles, ("batch", "season", "-o", "out")),
     ],
