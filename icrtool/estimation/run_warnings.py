@@ -39,7 +39,7 @@ USUAL_X_M = 0.15
 
 TWIST_SIGMAS = 2.0
 """Excess of the ICRs' separation over the track width, in standard deviations, below which a body twist turns as the
-robot does. Its controller then corrects the slip, or the twist is fused with a gyro."""
+robot does: its controller then corrects the slip."""
 
 WORTH_WARNING_SHARE = 0.1
 DELAY_SIGMAS = 3.0
@@ -139,8 +139,8 @@ def _twist_reasons(separation: float, std: float) -> list[Note]:
     if separation >= 1.0 + TWIST_SIGMAS * std:
         return []
     why = (
-        f"the ICRs are {separation:.2f} ± {std:.2f} of the track width apart: the body twist turns as the robot does; "
-        "its controller multiplies the width (set wheels.twist_width_m), or it is fused with a gyro"
+        f"the turns of the body twist are {separation:.2f} ± {std:.2f} of the robot's: they hold no slip, so that "
+        "these ICRs are not the ICRs of the tracks; set wheels.twist_width_m to the width that its controller uses"
     )
     return [note("twist_holds_multiplier", why)]
 

@@ -147,9 +147,9 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
     ),
     "twist_holds_multiplier": Explanation(
         "grave",
-        "The ICRs by a body twist are hardly further apart than the tracks.",
-        "The controller multiplies the width, or the twist is fused with a gyro.",
-        "Set `wheels.twist_width_m`, or record encoders.",
+        "A body twist turns as the robot does, or less; wheels that slip turn more.",
+        "The twist holds no slip in turns: the controller multiplies the width. The ICRs are not the tracks'.",
+        "Set `wheels.twist_width_m` to the width that the controller uses, or record encoders.",
     ),
 }
 """Codes of findings after which the ICRs of a run must not be used; they make `unusable_because`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
@@ -82,7 +83,7 @@ def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, wo
 
 
 def test_a_body_twist_that_turns_as_the_robot_does_makes_a_run_unusable() -> None:
-    """Its controller multiplies the width, or it is fused: the ICRs are those of the assumed width.
+    """Its controller multiplies the width: the ICRs are those of the assumed width.
 
     ICRs that are further apart than the width by more than their deviation are those of a robot that slips a little.
     """
@@ -100,6 +101,10 @@ def test_a_body_twist_that_turns_as_the_robot_does_makes_a_run_unusable() -> Non
     known = turning(1.0)
     run = fit(known, load_config(sets=[WIDTH]))
     assert not run.usable
+    (text,) = [one.text for one in run.document.notes if one.code == "twist_holds_multiplier"]
+    share = re.search(r"turns of the body twist are ([\d.]+) ± ([\d.]+) of the robot's", text)
+    assert share is not None
+    assert abs(float(share[1]) - 1.0) <= 3.0 * float(share[2]) + 0.01
     assert "wheels.twist_width_m" in run.summary["unusable_because"]
     assert fit(known, load_config(sets=[WIDTH, "wheels.twist_width_m=1.05"])).usable
     for share in (1 / 1.05, 1 / 1.09):
