@@ -145,23 +145,28 @@ def forecast_command(
       icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
     """  # noqa: D301 - click reads the escape
     _, calibration = read_calibration(calibration_file)
-    forecast, gyro = _forecasts(calibration, path)
+    run = run_directory.open_run(path) if run_directory.is_run_directory(path) else None
+    forecast, gyro = _forecasts(calibration, path, run)
     if output is not None:
         atomic.write_file(output, tables.forecast_csv(forecast, gyro))
     if plot is not None:
         from icrtool.output.figures.calibrations import forecast_figure
 
         measured_m = tables.measured_to_m(calibration)
-        formats.save_picture(forecast_figure(forecast, path.name, budgets_m, measured_m, gyro), plot)
+        document = None if run is None else run.document
+        figure = forecast_figure(forecast, path.name, budgets_m, measured_m, gyro, document=document)
+        formats.save_picture(figure, plot)
     printer.json("forecast", tables.forecast_document(forecast, calibration, budgets_m, gyro))
     printer.show(tables.forecast_blocks(forecast, calibration, budgets_m, gyro))
 
 
-def _forecasts(calibration: Calibration, path: Path) -> tuple[error_growth.Forecast, error_growth.Forecast | None]:
-    """Forecast along a run's path or the points of a table: wheels alone, and with a gyro where both have one."""
+def _forecasts(
+    calibration: Calibration, path: Path, run: Run | None
+) -> tuple[error_growth.Forecast, error_growth.Forecast | None]:
+    """Forecast along the path of a run, or the points of a table: wheels alone, and with a gyro where both have one."""
     with_gyro = calibration.gyro is not None and calibration.gyro.error_sources is not None
-    if run_directory.is_run_directory(path):
-        recording = pooled.turning_recording_of(run_directory.open_run(path))
+    if run is not None:
+        recording = pooled.turning_recording_of(run)
         with_gyro = with_gyro and recording.track.gyro is not None
         forecast = partial(error_growth.forecast_drive, calibration, recording)
     else:

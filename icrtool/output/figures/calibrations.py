@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from icrtool.alignment.estimator import ResidualsByEstimate
     from icrtool.calibration.error_growth import Forecast
     from icrtool.records.fleet_document import FleetLog
+    from icrtool.records.run_document import RunDocument
 
 CIRCLES = 20
 
@@ -36,9 +37,12 @@ FORECAST_KEY_COLUMNS = 4
 @styled
 def forecast_figure(
     forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, gyro: Forecast | None = None, *,
-    ax: Axes | None = None,
+    document: RunDocument | None = None, ax: Axes | None = None,
 ) -> Figure | Axes:  # fmt: skip
-    """Return the figure of a forecast, with a line for each budget and a line where measured errors end."""
+    """Return the figure of a forecast, with a line for each budget and a line where measured errors end.
+
+    `document`: of the run whose path it is; a run without datum has axes x and y. None: of a path with east and north.
+    """
     reached = within_budget(forecast.distance_m, forecast.p95_m, budgets_m[0]) if budgets_m else None
     answer = f"{error_text(forecast.p95_m[-1])} off (95 %) at the end of {forecast.distance_m[-1]:.0f} m"
     if reached is not None:
@@ -72,7 +76,7 @@ def forecast_figure(
     path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=style.ICR["color"], linewidth=0.8)
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
-    name_directions(path)
+    name_directions(path, document)
     sheet.legend(ncols=FORECAST_KEY_COLUMNS)
     return sheet.finished()
 

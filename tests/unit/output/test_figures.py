@@ -11,10 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from icrtool.calibration.error_growth import Forecast
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.filter_records import GATED
 from icrtool.output.figure_catalogue import FIGURES
-from icrtool.output.figures.calibrations import transfer
+from icrtool.output.figures.calibrations import forecast_figure, transfer
 from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.figures.style import new_figure, save_figure, style
 from icrtool.output.page.render import drawn_pictures
@@ -366,3 +367,15 @@ def test_a_long_title_is_cut_in_its_middle() -> None:
     assert title.endswith("end")
     assert "…" in title
     assert figure.texts[0].get_window_extent().x1 < figure.bbox.x1
+
+
+def test_a_forecast_along_a_run_in_a_local_frame_has_x_and_y(make_run: Callable[..., Run]) -> None:
+    metres = np.arange(1.0, 6.0)
+    forecast = Forecast(metres, *np.tile(metres / 10.0, (7, 1)))
+    for document, names in (
+        (None, ("East [m]", "North [m]")),
+        (make_run().document, ("East [m]", "North [m]")),
+        (make_run(datum=False).document, ("x [m]", "y [m]")),
+    ):
+        path = forecast_figure(forecast, "path", (0.3,), 5.0, document=document).axes[1]
+        assert (path.get_xlabel(), path.get_ylabel()) == names
