@@ -8,6 +8,9 @@ from functools import wraps
 from typing import TYPE_CHECKING, Any, Concatenate, Literal, Protocol, TypeVar, cast, overload
 
 import numpy as np
+from matplotlib.collections import Collection
+from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
+from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 from numpy.typing import NDArray
 
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.typing import ColorType
 
 Subject_contra = TypeVar("Subject_contra", contravariant=True)
 
@@ -36,6 +40,10 @@ INSIDE_GAP = 0.12
 
 INSIDE_KEY: style.Look = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 3, "fontsize": "small"}
 """Legend below the panels in the place of a caller's axes."""
+
+
+MID_GREY = 0.5
+"""Mean of red, green and blue below which a colour is dark."""
 
 
 class Drawing(Protocol[Subject_contra]):
@@ -72,11 +80,13 @@ class Sheet:
     figure : holds the axes
     ax : axes of the caller; None: `figure` has been made for this picture
     panels : the axes that were drawn into
+    of_caller : what `ax` held before
     """
 
     figure: Figure
     ax: Axes | None = None
     panels: list[Axes] = field(default_factory=list)
+    of_caller: tuple[Artist, ...] = ()
 
     def subplots(
         self, rows: int = 1, columns: int = 1, *, sharex: Share = False, sharey: Share = False,
@@ -134,6 +144,7 @@ class Sheet:
     def finished(self) -> Figure | Axes:
         """Return the caller's axes, or the figure with the names of its axes at fixed places."""
         if self.ax is not None:
+            self._fit_to_dark(self.ax)
             return self.ax
         below = ScaledTranslation(0.0, -LABEL_BELOW_IN, self.figure.dpi_scale_trans)
         left = ScaledTranslation(-LABEL_LEFT_IN, 0.0, self.figure.dpi_scale_trans)
@@ -141,6 +152,46 @@ class Sheet:
             axes.xaxis.set_label_coords(0.5, 0.0, axes.transAxes + below)
             axes.yaxis.set_label_coords(0.0, 0.5, axes.transAxes + left)
         return self.figure
+
+    def _fit_to_dark(self, ax: Axes) -> None:
+        """Give what was drawn on dark axes of the caller their colours in place of black, greys and white.
+
+        Black becomes the colour of the axes' names, white their background, and a grey lies between both.
+        """
+        fore, back = (np.array(to_rgb(one)) for one in (ax.xaxis.label.get_color(), _background(ax)))
+        if not (back.mean() < MID_GREY < fore.mean()):
+            return
+
+        def fitted(color: ColorType | Sequence[ColorType]) -> Floats | tuple[float, ...]:
+            rgba = np.atleast_2d(to_rgba_array(color)).copy()
+            grey = (np.ptp(rgba[:, :3], axis=1) == 0.0) & (rgba[:, 3] > 0.0)
+            share = rgba[grey, :1]
+            rgba[grey, :3] = (1.0 - share) * fore + share * back
+            return rgba if len(rgba) != 1 else tuple(rgba[0].tolist())
+
+        for panel in self.panels:
+            key = panel.get_legend()
+            keys = [] if key is None or key in self.of_caller else key.legend_handles
+            for artist in (*panel.lines, *panel.collections, *panel.patches, *keys):
+                if artist is None or artist in self.of_caller:
+                    continue
+                if isinstance(artist, Collection) and artist.get_array() is not None:
+                    # its colours are of a scale
+                    continue
+                of_line = ("color", "markerfacecolor", "markeredgecolor")
+                names = of_line if isinstance(artist, Line2D) else ("facecolor", "edgecolor")
+                found = {name: getattr(artist, f"get_{name}")() for name in names}
+                artist.set(**{name: fitted(one) for name, one in found.items() if len(to_rgba_array(one))})
+            for text in panel.texts:
+                # light words have the caller's colour already
+                if text not in self.of_caller and np.mean(to_rgb(text.get_color())) < MID_GREY:
+                    text.set(color=fitted(text.get_color()))
+
+
+def _background(ax: Axes) -> ColorType:
+    """Return the colour behind axes: the colour of their figure where they are transparent."""
+    own = ax.get_facecolor()
+    return own if to_rgba(own)[3] > 0.0 else cast("Figure", ax.get_figure(root=True)).get_facecolor()
 
 
 def _places(sizes: Floats) -> tuple[list[float], list[float]]:
@@ -166,4 +217,4 @@ def new_sheet(
         layout = {"height_in": height_in, "width_in": width_in, "wspace": wspace, "hspace": hspace}
         return Sheet(style.new_figure(title, subtitle, margins_in=margins_in, **layout))
     ax.set_title(style.drawable(title), loc="left", parse_math=False, wrap=True)
-    return Sheet(cast("Figure", ax.get_figure(root=True)), ax)
+    return Sheet(cast("Figure", ax.get_figure(root=True)), ax, of_caller=tuple(ax.get_children()))

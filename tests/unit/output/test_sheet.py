@@ -8,7 +8,9 @@ from dataclasses import replace
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib import style as styles
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -101,6 +103,49 @@ def test_axes_hold_the_lines_of_the_figure_in_the_callers_style(run: Run, users_
     assert ax.xaxis.label.get_fontsize() == SETTINGS["font.size"]
     assert own.xaxis.label.get_fontsize() == 9.5
     assert np.allclose(named["filter"].get_xydata()[-1], of_own["filter"].get_xydata()[-1])
+
+
+def drawn_colors(axes: Axes) -> list[tuple[float, float, float]]:
+    """Colours of the lines, areas and words in axes that are seen."""
+    found: list[object] = []
+    for line in axes.lines:
+        found += [line.get_color()] if line.get_linestyle() != "None" else []
+        found += [line.get_markeredgecolor()] if line.get_marker() not in ("None", "") else []
+    for one in axes.collections:
+        found += [*one.get_edgecolor()] if one.get_array() is None else []
+    found += [text.get_color() for text in axes.texts]
+    return [to_rgba(one)[:3] for one in found if to_rgba(one)[3] > 0.0]
+
+
+@pytest.mark.parametrize("name", [*OF_RUNS, *OF_REPORTS])
+def test_nothing_is_black_on_the_dark_axes_of_a_caller(name: str, run: Run, report: DropoutReport) -> None:
+    draw = drawings(run, report)[name]
+    with styles.context("dark_background"):
+        ax = Figure(figsize=(9.0, 6.0)).subplots()
+        (own,) = ax.plot([0.0], [0.0], color="black")
+        draw(ax=ax)
+        ax.figure.canvas.draw()
+    shown = [color for one in all_axes(ax) for color in drawn_colors(one)]
+    assert own.get_color() == "black"
+    assert shown.count((0.0, 0.0, 0.0)) == 1
+    # on light axes of a caller the same pens are black
+    light = draw(ax=Figure(figsize=(9.0, 6.0)).subplots())
+    assert isinstance(light, Axes)
+    pens = [color for one in all_axes(light) for color in drawn_colors(one)]
+    assert (0.0, 0.0, 0.0) in pens or name in ("gnss_difference", "dropout_summary")
+    greys = {round(1.0 - one[0], 9) for one in pens if len(set(one)) == 1}
+    assert greys <= {round(one[0], 9) for one in shown}
+
+
+def test_the_key_on_dark_axes_has_the_colours_of_the_lines(run: Run) -> None:
+    with styles.context("dark_background"):
+        ax = icrtool.figures.trajectory(run, ax=Figure(figsize=(7.0, 6.0)).subplots())
+    key = ax.get_legend()
+    assert key is not None
+    handles = {text.get_text(): one for text, one in zip(key.get_texts(), key.legend_handles, strict=True)}
+    lines = {str(line.get_label()): line for line in ax.lines}
+    assert to_rgba(handles["filter"].get_color()) == to_rgba(lines["filter"].get_color()) == (1.0, 1.0, 1.0, 1.0)
+    assert to_rgba(handles["start"].get_markerfacecolor()) == (0.0, 0.0, 0.0, 1.0)
 
 
 def test_a_picture_is_opaque_and_white_in_the_corners(tmp_path, run: Run) -> None:
