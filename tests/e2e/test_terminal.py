@@ -124,6 +124,29 @@ def test_a_good_drive_is_answered_on_one_screen(screen: Screen) -> None:
     assert lines[-1].endswith("report.html")
 
 
+@pytest.mark.parametrize("times_s", [(100,), (60, 120, 180)])
+def test_the_stretches_of_a_drive_on_several_grounds_are_whole(screen: Screen, times_s: tuple[int, ...]) -> None:
+    # half the separation of the ICRs is 0.3 m or 0.45 m by turns
+    icrs = ("0.3,-0.3,0.05", "0.45,-0.45,0.05")
+    changes = [word for place, at_s in enumerate(times_s) for word in ("--change", f"{at_s}:{icrs[place % 2]}")]
+    assert screen("simulate", "-o", "grounds.mcap", "--duration", "240", "-q", *ROBOT, *changes)[0] == 0
+    status, lines = screen("fit", "grounds.mcap", *ROBOT, "--plots", "none")
+    # the next command is one line, however long
+    check_fits([line[:COLUMNS] if line.startswith("next ") else line for line in lines])
+    assert status == 0
+    assert "PARTLY      the ground changes: no single multiplier fits the whole drive" in lines
+    first = next(number for number, line in enumerate(lines) if line.startswith("multiplier "))
+    row = "".join(lines[first : first + 3])
+    found = re.findall(r"(\d+) to (\d+) s: (\d\.\d{3}) ± (0\.\d{3})", row)
+    assert len(found) == len(times_s) + 1
+    for begin_s, at_s in zip([int(one[0]) for one in found[1:]], times_s, strict=True):
+        assert abs(begin_s - at_s) < 10
+    for place, (_, _, multiplier, _) in enumerate(found[1:]):
+        assert float(multiplier) == pytest.approx((0.6, 0.9)[place % 2] / 0.61, rel=0.03)
+    assert len({one[2] for one in found}) == len(found)
+    assert not any(line.endswith("…") for line in lines[: first + 3])
+
+
 def test_a_drive_that_shows_too_little_says_what_to_drive(screen: Screen) -> None:
     straight = ("--path", "straight", "--duration", "60", "-q")
     assert screen("simulate", "-o", "straight.mcap", *straight)[0] == 0

@@ -36,7 +36,7 @@ from icrtool.output.text_format import (
     run_title,
     topics_text,
 )
-from icrtool.records.measurements import RESPONSE_S
+from icrtool.records.measurements import RESPONSE_S, GroundStretch
 from icrtool.records.notes import Note, first_to_read, is_grave
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.run_document import ControllerNumbers, RunDocument
@@ -87,7 +87,9 @@ def run_blocks(summary: RunDocument) -> list[Block]:
     turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
     driven = f"{distance_text(summary.drive.distance_m)}, {duration_text(summary.drive.duration_s)}"
     verdict = "" if not summary.usable else "PARTLY" if summary.partly_because else "USABLE"
-    line = f"{verdict:12}{summary.partly_because or warnings_line(summary.notes)}".rstrip()
+    grounds = unstated_grounds(summary) if summary.usable else ()
+    why = "the ground changes: no single multiplier fits the whole drive" if grounds else summary.partly_because
+    line = f"{verdict:12}{why or warnings_line(summary.notes)}".rstrip()
     shown = line if len(line) <= BRIEF_WIDTH else f"{line[: BRIEF_WIDTH - 1].rstrip()}…"
     roles: dict[str, list[str]] = {}
     for stream in summary.streams:
@@ -98,6 +100,7 @@ def run_blocks(summary: RunDocument) -> list[Block]:
         unusable_line(summary),
         Title(run_title(summary), f"{driven}, turned {turned}"),
         Line(shown, "good" if summary.usable else "as is"),
+        Facts(_stretch_rows(grounds)),
         *(number_blocks(summary) if summary.usable else ()),
         Checks(run_checks(summary)),
         Facts([("corrected", "; ".join(corrections(summary))), ("inputs", inputs)]),
@@ -108,13 +111,27 @@ def run_blocks(summary: RunDocument) -> list[Block]:
 def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
     """Return where a run was written, and what to do next; `examine`: command that names what is wrong in its log."""
     command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
-    if (stretches := summary.wheels.ground_stretches) and summary.inputs and not summary.request.changes_s:
+    if (stretches := unstated_grounds(summary)) and summary.inputs:
         times = [word for one in stretches[1:] for word in ("--terrain-change", f"{one.begin_s:.0f}")]
         command = shlex.join(["icrtool", "fit", summary.inputs[0].path, *times])
     drive = advice(summary)
     distance = "without GNSS: not known yet, icrtool dropout-report tests it" if summary.usable else ""
     facts = Facts([("distance", distance), ("written to", place), ("next", drive)])
     return [Section("", [facts, next_line("" if drive else command)])]
+
+
+def unstated_grounds(summary: RunDocument) -> tuple[GroundStretch, ...]:
+    """Return the stretches of a drive whose ground changes, as found; none where the user stated the changes."""
+    return () if summary.request.changes_s else summary.wheels.ground_stretches
+
+
+def _stretch_rows(stretches: Sequence[GroundStretch]) -> list[Row]:
+    """Return time and multiplier ± σ of stretches, two on a line."""
+    found = [
+        f"{one.begin_s:.0f} to {one.end_s:.0f} s: {one.multiplier:.3f} ± {max(one.multiplier_std, 0.001):.3f}"
+        for one in stretches
+    ]
+    return [("" if row else "multiplier", ", ".join(found[row : row + 2])) for row in range(0, len(found), 2)]
 
 
 def next_line(command: str) -> Line:
