@@ -21,7 +21,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.open_loop import open_loop_path
 from icrtool.kernels.track import trial_ends
-from icrtool.motion.models import controller_model
+from icrtool.motion.models import MODELS, controller_model
 from icrtool.motion.recording import Trials, cut_windows, predicted_path
 from icrtool.motion.window_fit import own_constants
 from icrtool.output.files.formats import json_bytes
@@ -488,10 +488,11 @@ def test_the_chart_of_a_comparison_follows_the_group_and_the_measure(chrome: Bro
     page = chrome.page(width=360, height=780)
     page.open(file)
     labels = "[...document.querySelectorAll('#error-keys label')].map((one) => one.textContent.trim())"
-    assert page.evaluate(labels) == ["calibration of grass (held out)", f"calibration of {HOSTILE}"]
-    page.evaluate("document.getElementById('group').value = '1'")
+    # the calibration of grass costs in the runs of the second group
+    assert page.evaluate(labels) == ["calibration of grass", f"calibration of {HOSTILE} (held out)"]
+    page.evaluate("document.getElementById('group').value = '0'")
     page.evaluate("document.getElementById('group').dispatchEvent(new Event('change')), null")
-    assert page.evaluate(labels)[0] == "calibration of grass"
+    assert page.evaluate(labels) == ["calibration of grass (held out)", f"calibration of {HOSTILE}"]
     page.evaluate("document.querySelector('input[value=expected]').click()")
     assert page.evaluate("document.querySelectorAll('#error-chart canvas').length") == 1
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
@@ -536,6 +537,28 @@ def test_a_phone_shows_multiplier_and_distance_of_the_robot_without_scrolling(ch
     cells = page.evaluate("[...document.querySelectorAll('#table td')].map((one) => one.textContent)")
     assert {"not usable", "8.0\u00a0m", ">\u00a020.0\u00a0m"} <= {one.replace("> ", ">\u00a0") for one in cells}
     assert "1 cannot" in page.evaluate("document.querySelector('header').textContent")
+
+
+def test_the_table_of_the_robot_fills_its_row_and_names_model_and_file(chrome: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    robot = {
+        "robot": "husky-a200", "group": "", "logs": ["a", "b"], "file": "calibrations/husky-a200.json",
+        "recommended": "five", "multiplier": 1.6691, "multiplier_std": 0.0108, "icrs_m": [0.8, -0.9, 0.0],
+        "within_m": 14.2,
+    }  # fmt: skip
+    alone = {"robot": "", "group": "", "logs": ["c"], "reason": "one log alone"}
+    file.write_text(page_of_fleet({**FLEET, "calibrations": [robot, alone]}, tmp_path), encoding="utf-8")
+    page = chrome.page(width=1280, height=800)
+    page.open(file)
+    share = "document.querySelector('#robots table').clientWidth / document.querySelector('#robots').clientWidth"
+    assert page.evaluate(share) > 0.95
+    assert page.evaluate("(one => one.scrollWidth - one.clientWidth)(document.querySelector('#robots .scroll'))") <= 0
+    rows = page.evaluate(
+        "[...document.querySelectorAll('#robots tr')].map((row) => [...row.cells].map((one) => one.textContent))"
+    )
+    assert rows[0][-2:] == ["motion model", "calibration file"]
+    assert rows[1][-2:] == [MODELS["five"].label, "calibrations/husky-a200.json"]
+    assert (rows[2][1], rows[2][-1]) == ("one log alone", "")
 
 
 def test_the_table_of_a_fleet_has_date_duration_and_distance_without_scrolling(chrome: Browser, tmp_path: Path) -> None:

@@ -311,7 +311,7 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
     """Return the table of the calibration from all logs of each robot."""
     grouped = any(one.group for one in calibrations)
     rows: list[list[str | Cell]] = []
-    incomplete = any(one.left_out for one in calibrations)
+    incomplete, labels = any(one.left_out for one in calibrations), {name: one.label for name, one in MODELS.items()}
     for one in calibrations:
         numbers = [Cell(one.reason), Cell("")]
         if one.multiplier is not None:
@@ -324,10 +324,12 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
         icrs = ", ".join(map(signed, one.icrs_m))
         more = [one.group] if grouped else []
         left_out = [", ".join(one.left_out)] if incomplete else []
-        rows.append([one.robot or "all logs", *numbers, *more, f"{len(one.logs)}", icrs, *left_out])
+        model = labels.get(one.recommended, one.recommended)
+        rows.append([one.robot or "all logs", *numbers, *more, f"{len(one.logs)}", icrs, model, one.file, *left_out])
     group, omitted = ("group",) if grouped else (), ("left out",) if incomplete else ()
-    head = ("robot", "multiplier", "within 0.5 m (95 %) for", *group, "logs", "ICRs right, left, x [m]", *omitted)
-    return Table(f"lrr{'l' * grouped}rr{'l' * incomplete}", rows, head, "Each log was predicted without itself")
+    head = ("robot", "multiplier", "within 0.5 m (95 %) for", *group, "logs", "ICRs right, left, x [m]",
+            "motion model", "calibration file", *omitted)  # fmt: skip
+    return Table(f"lrr{'l' * grouped}rrll{'l' * incomplete}", rows, head, "Each log was predicted without itself")
 
 
 def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
@@ -444,13 +446,17 @@ def comparison_page(found: GroupComparison, title: str) -> str:
             for name in names
         ]
         by_group.append({"horizons_m": horizons, "models": models, "reference": {"p95": [], "expected": []}})
+    # the chart begins with the group in whose runs a foreign calibration costs most
+    costs = [one for one in found.costs if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None]
+    dearest = max(costs or found.costs, key=lambda one: one.p95_m or 0.0, default=None)
     verdict = comparison_title(found)
     sections = [one for one in transfer_blocks(found) if len(found.pairs) > 1 or not isinstance(one, str)]
     return render(
         (*VENDOR, "columns.js", "charts.js", "comparison.js"), {"by_group": by_group}, title=title,
         kind=f"Drive without GNSS: groups of runs compared ({title})",
         blocks=[verdict._replace(facts=f"{verdict.facts} {groups}.".lstrip()), *sections],
-        groups=names, folded_models=0, pictures=drawn_pictures([("transfer", transfer(found))]),
+        groups=names, opened="" if dearest is None else dearest.tested_on, folded_models=0,
+        pictures=drawn_pictures([("transfer", transfer(found))]),
     )  # fmt: skip
 
 
