@@ -1,4 +1,4 @@
-"""Geodetic positions that are mirrored: the sign of a latitude or longitude, or both exchanged."""
+"""Positions that are mirrored: the sign of a latitude or longitude, or both exchanged, by a heading or a gyro alone."""
 
 from __future__ import annotations
 
@@ -6,36 +6,48 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from icrtool.alignment.clock_search import with_configured_delays
 from icrtool.alignment.conventions import DECISIVE, NamedFit, gyro_sense
 from icrtool.alignment.log_track import FEWEST_OVERLAPPING, check_streams, windows_of_log
+from icrtool.alignment.turn_rates import Z_UP
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.arrays import trapezoids, wrapped
 from icrtool.records.notes import note
 from icrtool.records.run import width_or_usual_m
-from icrtool.records.samples import Datum, PositionFixes
+from icrtool.records.samples import Datum, HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog
 
 WITNESS_SIGMAS = 5.0
 """Turn of the heading by the wheels, in its standard deviations, from which on both turn in one sense."""
+
+LEAST_TURN_RAD = math.pi / 2
+"""Smallest range of the heading by a gyro alone [rad]. The drift of a gyro that turns less may look like a turn."""
 
 EARTH_RADIUS_M, EARTH_ECCENTRICITY_2 = 6_378_137.0, 6.694379990141e-3
 """Equatorial radius [m] and squared eccentricity of the ellipsoid WGS 84."""
 
 
 def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
-    """Return the log with its geodetic positions, and their datum, exchanged back where they are mirrored.
+    """Return the log with its positions, and their datum, exchanged back where they are mirrored.
 
     Gyro, heading and wheels are three witnesses of the sense in which the robot turns. Where they agree, and the course
-    over ground turns in the other sense, the positions are mirrored. Preset ``paper`` corrects nothing.
+    over ground turns in the other sense, the positions are mirrored. In a log without a heading, gyro and wheels are
+    the witnesses; two faults, an exchanged pair of sides and a gyro upside down, would look the same. Metric positions
+    with a heading are left to `icrtool.alignment.conventions`. Preset ``paper`` corrects nothing.
     """
-    if log.datum is None or log.gyro is None or not len(log.heading.stamp_ns) or not config.filter.rules.corrects:
+    by_gyro = not len(log.heading.stamp_ns)
+    if not config.filter.rules.corrects or (not by_gyro and (log.datum is None or log.gyro is None)):
         return log
     width = width_or_usual_m(config.robot.track_width_m)
     moved, inner, _ = with_configured_delays(log, config)
     try:
         named = with_wheel_speeds(moved, inner)
+        if by_gyro:
+            named = _with_turned_heading(named)
         check_streams(named)
     except (ConfigError, DataError):
         # it is refused later, with its reason
@@ -44,13 +56,10 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
     if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return log
     as_sent = NamedFit.of(windows)
-    if as_sent.turn_sigmas < WITNESS_SIGMAS or gyro_sense(named, windows.track) <= 0:
+    if as_sent.turn_sigmas < WITNESS_SIGMAS or (not by_gyro and gyro_sense(named, windows.track) <= 0):
         return log
     found = []
-    for words, exchange in EXCHANGES:
-        one = exchange(log, log.datum)
-        if one is None:
-            continue
+    for words, one in _exchanges(log):
         fixes = one.gnss
         track = windows.track._replace(north=fixes.north_m, east=fixes.east_m)
         found.append((NamedFit.of(replace(windows, track=track)), words, one))
@@ -60,14 +69,50 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
     gain = as_sent.cost(scatter) - min(costs, default=math.inf)
     if not gain > DECISIVE:
         return log
-    # of exchanges that fit alike the offset of the heading decides
     near = [one for one, cost in zip(found, costs, strict=True) if cost < min(costs) + DECISIVE]
-    _, words, right = min(near, key=lambda one: abs(one[0].offset_rad))
+    if by_gyro:
+        # no heading decides between exchanges that fit alike: the path is the same, turned as a whole
+        what, right = " or ".join(words for _, words, _ in near), near[0][2]
+        witnesses = "gyro and wheels, which agree"
+        what += " (or the gyro is upside down, and the sides are exchanged)"
+    else:
+        # of exchanges that fit alike the offset of the heading decides
+        _, what, right = min(near, key=lambda one: abs(one[0].offset_rad))
+        witnesses = "gyro, heading and wheels, which agree"
     why = (
-        f"the positions turn in the opposite sense to gyro, heading and wheels, which agree: {words}; corrected "
+        f"the positions turn in the opposite sense to {witnesses}: {what}; corrected "
         f"(twice the gain in log-likelihood {gain:.0f}, decisive from {DECISIVE:.0f} on)"
     )
     return replace(right, notes=(*right.notes, note("positions_mirrored", why, log.name)))
+
+
+def _with_turned_heading(log: RobotLog) -> RobotLog:
+    """Return the log with a heading that its gyro with z up turns, from any begin; without one where none turns.
+
+    The bias of the gyro is its rate where the wheels do not turn, by regression on their turn.
+    """
+    for gyro in log.gyros:
+        rate = gyro.rates_radps @ Z_UP
+        wheels = log.wheels.v_left_mps - log.wheels.v_right_mps
+        apart = np.interp(gyro.stamp_ns, log.wheels.stamp_ns, wheels)
+        finite = np.isfinite(rate) & np.isfinite(apart)
+        if np.count_nonzero(finite) < FEWEST_OVERLAPPING or not np.ptp(apart[finite]) > 0.0:
+            continue
+        stamps, rate, apart = gyro.stamp_ns[finite], rate[finite], apart[finite]
+        _, bias = np.polyfit(apart, rate, 1)
+        heading = trapezoids((stamps - stamps[0]) / 1e9, rate - bias)
+        if np.ptp(heading) > LEAST_TURN_RAD:
+            return replace(log, heading=HeadingSamples(stamps, wrapped(heading), np.full(len(stamps), np.nan)))
+    return log
+
+
+def _exchanges(log: RobotLog) -> list[tuple[str, RobotLog]]:
+    """Return what may be wrong with the positions of a log, in words, and the log without it."""
+    if log.datum is None:
+        mirrored = replace(log.gnss, east_m=-log.gnss.east_m, cov_north_east_m2=-log.gnss.cov_north_east_m2)
+        return [("two axes are exchanged, or one has the other sign", replace(log, gnss=mirrored))]
+    tried = ((words, exchange(log, log.datum)) for words, exchange in EXCHANGES)
+    return [(words, one) for words, one in tried if one is not None]
 
 
 def _exchanged(log: RobotLog, datum: Datum, exchange: Callable[[PositionFixes], PositionFixes]) -> RobotLog:

@@ -351,7 +351,8 @@ OF_POSITIONS: dict[str, Explanation] = {
         "info",
         "The positions turn in the opposite sense to the robot: two of their axes, or the sign of one, are exchanged.",
         "They are exchanged back, except with preset `paper`.",
-        "Correct the frame of the position reference, or the order and signs of latitude and longitude.",
+        "Correct the frame of the position reference, or the order and signs of latitude and longitude. Without a "
+        "heading, check that the gyro is not upside down and the sides are not exchanged, which looks the same.",
     ),
     "gnss_float_as_fixed": Explanation(
         "warning",

@@ -1,4 +1,4 @@
-"""Geodetic positions that are mirrored are named and exchanged back; gyro, heading and wheels are right."""
+"""Positions that are mirrored are named and exchanged back; gyro and wheels, and heading if any, are right."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pymap3d import geodetic2ned, ned2geodetic
 from icrtool.alignment.mirrored_positions import metres_per_radian, with_right_positions
 from icrtool.config import load_config
 from icrtool.pipeline import fit
-from icrtool.records.samples import Datum, GyroSamples
+from icrtool.records.samples import NO_HEADINGS, Datum, GyroAxes, GyroSamples
 from icrtool.records.tables import RobotLog
 from support.drives import EPOCH_NS, ICRS, make_log
 
@@ -142,3 +142,53 @@ def test_few_turns_between_long_lines_are_enough(how: dict[str, int], words: str
     assert [one.code for one in found.notes] == ["positions_mirrored"]
     assert words in found.notes[0].text
     np.testing.assert_allclose(found.gnss.east_m, log.gnss.east_m, atol=5e-3)
+
+
+def without_heading(log: RobotLog, *, sense: int = 1, bias_radps: float = 0.003) -> RobotLog:
+    """Return the log with the raw rates of a gyro (z up; with sense -1 down), and neither heading nor its choice."""
+    gyro = log.gyro
+    assert gyro is not None
+    rates = np.random.default_rng(1).normal(0.0, 0.01, (len(gyro.rate_radps), 3))
+    rates[:, 2] = bias_radps - sense * gyro.rate_radps
+    return replace(log, heading=NO_HEADINGS, gyro=None, gyros=(GyroAxes("/imu", gyro.stamp_ns, rates),))
+
+
+@pytest.mark.parametrize(("how", "words"), SPOILT)
+@pytest.mark.parametrize("lawn", [False, True])
+def test_without_a_heading_gyro_and_wheels_are_witnesses(how: dict[str, int], words: str, lawn: bool) -> None:
+    log = lawn_log() if lawn else log_of()
+    run = fit(read_as(without_heading(log), **how), CONFIG)
+    (text,) = [one.text for one in run.document.notes if one.code == "positions_mirrored"]
+    assert words in text
+    assert "upside down" in text
+    assert not {one.code for one in run.document.notes} & {"sides_swapped", "side_reversed", "wheels_filtered"}
+    assert run.usable
+    final, std = run.summary["icr"]["final"], run.summary["icr"]["final_std"]
+    for name, true in zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), ICRS, strict=True):
+        assert abs(final[name] - true) < 3.0 * std[name]
+
+
+def test_without_a_heading_metric_positions_are_mirrored_back() -> None:
+    log = replace(without_heading(log_of()), datum=None)
+    assert with_right_positions(log, CONFIG) is log
+    for spoilt in (
+        replace(log.gnss, east_m=-log.gnss.east_m),
+        replace(log.gnss, north_m=log.gnss.east_m, east_m=log.gnss.north_m),
+    ):
+        run = fit(replace(log, gnss=spoilt), CONFIG)
+        assert "positions_mirrored" in {one.code for one in run.document.notes}
+        final, std = run.summary["icr"]["final"], run.summary["icr"]["final_std"]
+        assert abs(final["y_icr_right_m"] - ICRS[0]) < 3.0 * std["y_icr_right_m"]
+        assert abs(final["y_icr_left_m"] - ICRS[1]) < 3.0 * std["y_icr_left_m"]
+
+
+@pytest.mark.parametrize("bias_radps", [0.0, 0.02])
+def test_without_a_heading_right_positions_are_left_as_they_are(bias_radps: float) -> None:
+    for one in (log_of(), log_of(seed=6), lawn_log()):
+        right = without_heading(one, bias_radps=bias_radps)
+        swapped = replace(right, wheels=replace(right.wheels, left=right.wheels.right, right=right.wheels.left))
+        for log in (right, without_heading(one, sense=-1, bias_radps=bias_radps), swapped, replace(right, gyros=())):
+            assert with_right_positions(log, CONFIG) is log
+    # gyro and wheels must agree: a gyro upside down is no witness
+    mirrored = read_as(without_heading(log_of(), sense=-1), longitude=-1)
+    assert with_right_positions(mirrored, CONFIG) is mirrored
