@@ -24,7 +24,7 @@ from icrtool.records.tables import RobotLog
 WITNESS_SIGMAS = 5.0
 """Turn of the heading by the wheels, in its standard deviations, from which on both turn in one sense."""
 
-LEAST_TURN_RAD = math.pi / 2
+LEAST_GYRO_TURN_RAD = math.pi / 2
 """Smallest range of the heading by a gyro alone [rad]. The drift of a gyro that turns less may look like a turn."""
 
 EARTH_RADIUS_M, EARTH_ECCENTRICITY_2 = 6_378_137.0, 6.694379990141e-3
@@ -101,7 +101,7 @@ def _with_turned_heading(log: RobotLog) -> RobotLog:
         stamps, rate, apart = gyro.stamp_ns[finite], rate[finite], apart[finite]
         _, bias = np.polyfit(apart, rate, 1)
         heading = trapezoids((stamps - stamps[0]) / 1e9, rate - bias)
-        if np.ptp(heading) > LEAST_TURN_RAD:
+        if np.ptp(heading) > LEAST_GYRO_TURN_RAD:
             return replace(log, heading=HeadingSamples(stamps, wrapped(heading), np.full(len(stamps), np.nan)))
     return log
 
