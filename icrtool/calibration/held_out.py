@@ -379,7 +379,7 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
 
 
-def measure_controller_errors(table: HeldOut) -> ControllerErrors | None:
+def measure_controller_errors(table: HeldOut, *, has_gyro: bool) -> ControllerErrors | None:
     """Return the errors of the controller's model in each fold, fitted without this fold.
 
     Returns
@@ -392,7 +392,7 @@ def measure_controller_errors(table: HeldOut) -> ControllerErrors | None:
     h = table.horizons_m.index(CHOICE_HORIZON_M)
     velocities = near[:, :3] / near[:, 3:4]
     turn_rate = turn_rate_std = None
-    if table.has_gyro:
+    if has_gyro:
         of_gyro, of_stretches = _window_errors(table, f"{RECOMMENDED}{GYRO_SUFFIX}", TWIST_OVER_M)
         if len(of_gyro) >= FEWEST_TESTED:
             squares = (of_gyro[:, 2] / of_gyro[:, 3]) ** 2

@@ -207,11 +207,22 @@ def calibrate_recordings(
 
 
 def calibration_from(
-    table: held_out.HeldOut, robot: documents.CalibratedRobot | None = None, findings: tuple[Note, ...] = ()
+    table: held_out.HeldOut,
+    robot: documents.CalibratedRobot | None = None,
+    findings: tuple[Note, ...] = (),
+    *,
+    has_gyro: bool | None = None,
 ) -> Calibration:
-    """Return the calibration from the recordings of a held-out table."""
+    """Return the calibration from the recordings of a held-out table.
+
+    Parameters
+    ----------
+    has_gyro : whether the turn rate of the table is measured by a gyro; None: where the table has one. A rate that is
+        derived from a measured heading belongs to this heading and not to the calibration.
+    """
+    has_gyro = table.has_gyro if has_gyro is None else has_gyro
     recordings, best = table.recordings, table.fits[RECOMMENDED]
-    with_gyro = table.fits[f"{RECOMMENDED}{held_out.GYRO_SUFFIX}"].fitted if table.has_gyro else None
+    with_gyro = table.fits[f"{RECOMMENDED}{held_out.GYRO_SUFFIX}"].fitted if has_gyro else None
     logs = []
     for i, one in enumerate(recordings):
         own, metres = best.constants(i), float(one.track.distance[-1])
@@ -239,7 +250,7 @@ def calibration_from(
     geometry, covariance = table.fits[FIVE].fitted.geometry(robot.track_width_m)
     shared_std = multiplier_between_std(table, robot.track_width_m, geometry.multiplier)
     found = fitted_document(best.fitted, geometry, covariance, robot, shared_std=shared_std)
-    errors = held_out.measure_controller_errors(table)
+    errors = held_out.measure_controller_errors(table, has_gyro=has_gyro)
     return Calibration(
         schema=documents.CALIBRATION_SCHEMA,
         tool_version=__version__,

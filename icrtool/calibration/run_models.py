@@ -231,7 +231,8 @@ def compare_models(
     rows += adaptive_rows(recording, heading, calibrations, driven, refit_sensors=refit_sensors)
     calibration = None
     if run.track_width_m is not None:
-        calibration = pooled.calibration_from(found, pooled.robot_of(run, recording.width_m), pooled.use_notes(run))
+        robot, used = pooled.robot_of(run, recording.width_m), pooled.use_notes(run)
+        calibration = pooled.calibration_from(found, robot, used, has_gyro=heading == "gyro")
     return ComparedModels(tuple(rows), found, recording.track, heading, tuple(notes), calibration)
 
 

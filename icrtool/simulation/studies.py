@@ -256,7 +256,7 @@ STUDIES: dict[str, Study] = {
             Number("{series}, {value}: converged", "converged", "percent", "%", START_FATES, STARTS),
             Number("{series}, {value}: ends inverted", "inverted", "percent", "%", at=STARTS),
         ),
-        title="Guarded runs converge: {answer}",
+        title="Guarded: {answer} converge",
         answer=Number("{value}", "converged", "percent", "%", at=STARTS, series="guard, printed derivatives"),
         summary=lambda found: {fate: float(found[fate].mean()) for fate in FATES},
     ),

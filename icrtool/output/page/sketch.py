@@ -122,6 +122,6 @@ def geometry_sketch(found: Calibration) -> Geometry:
     )
     bar_m = _round_length(LONGEST_BAR * WIDTH / scale)
     return Geometry(
-        icrs, (WIDTH / 2.0 - scale * half, WIDTH / 2.0 + scale * half), (f"{y_left:+.3f} m", f"{y_right:+.3f} m"),
+        icrs, (WIDTH / 2.0 - scale * half, WIDTH / 2.0 + scale * half), (f"{y_left:+z.3f} m", f"{y_right:+z.3f} m"),
         bar_m * scale, bar_m,
     )  # fmt: skip

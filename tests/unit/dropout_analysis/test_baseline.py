@@ -29,6 +29,7 @@ from icrtool.output.files.formats import json_bytes
 from icrtool.records.acceptance import Verdict
 from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.fleet_document import FleetFile, FleetLog
+from icrtool.records.rows import row_of
 from icrtool.records.run import Run
 from icrtool.records.samples import InputFile
 from support.edits import edited
@@ -251,12 +252,12 @@ def test_the_interval_of_pooled_drives_holds_the_next_drive(report: DropoutRepor
     gate = parse_gate("no_slip.expected@2m <= baseline")
     result = report.result("no_slip")
     value, half = result.column("expected_error_m")[1], []
-    held, draws = 0, 200
+    held, draws, spread = 0, 200, row_of("no_slip").spread.between
     for _ in range(draws):
         # The next drive is the report itself, so the others are drawn about a mean that it was drawn about.
-        mean = math.exp(rng.normal(0.0, 0.45))
+        mean = math.exp(rng.normal(0.0, spread))
         pooled = pooled_baseline(
-            [scaled(report, mean * math.exp(rng.normal(0.0, 0.45))) for _ in range(4)], "drives", "folder"
+            [scaled(report, mean * math.exp(rng.normal(0.0, spread))) for _ in range(4)], "drives", "folder"
         )
         before, _ = pooled.number_for(gate)
         half.append(pooled.half_width("no_slip", 2.0, "expected", result.block_sums[1], 1.0, same=False))

@@ -39,6 +39,8 @@ def test_a_line_without_its_mark_sets_the_default_or_a_possible_value(section: s
         assert document[key] == default
     if key in ("wheel_left", "wheel_right"):
         document = {"wheel_left": "/left", "wheel_right": "/right"} | document
+    if key in ("twist_speed", "twist_turn"):
+        document = {"twist_speed": "speed", "twist_turn": "turn"} | document
     assert parse_config({section: document})
 
 
