@@ -81,7 +81,7 @@ def run(
     season: Path, jobs: int = 2, robot: str | None = None, sets: tuple[str, ...] = (), **options: object
 ) -> dict[str, FleetLog]:
     files = ResultFiles(page=bool(options.pop("page", True)))
-    asked = BatchRequest(ConfigSources(None, robot, sets), files=files, timeout_s=20.0, **options)  # type: ignore[arg-type]
+    asked = BatchRequest(ConfigSources(None, robot, sets), files=files, timeout_s=60.0, **options)  # type: ignore[arg-type]
     requests = plan([season], season.parent / "out", asked)
     with ThreadPoolExecutor(jobs) as executor:
         rows = list(run_batch(requests, executor, asked))
@@ -112,7 +112,7 @@ def test_a_log_that_hangs_is_ended(season: Path) -> None:
     requests = plan([season], season.parent / "out", BatchRequest())
     begun = time.monotonic()
     with ThreadPoolExecutor(2) as executor:
-        rows = list(run_batch(requests, executor, BatchRequest(timeout_s=4.0)))
+        rows = list(run_batch(requests, executor, BatchRequest(timeout_s=10.0)))
     assert time.monotonic() - begun < 40
     assert {row.log: row.status for row in rows} == {"hang.mcap": "failed", "a.mcap": "done"}
     assert {row.log: row.usable for row in rows} == {"hang.mcap": False, "a.mcap": True}
