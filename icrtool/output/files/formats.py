@@ -187,6 +187,9 @@ It lists every file of the run and of its dropout report, but not the page. The 
 report is replaced, the list does not name its files.
 """
 
+LARGEST_SUMS_BYTES = 1 << 20
+"""Largest size of the list of sums of a run [bytes]. The list of a run has some 40 lines of 160 bytes."""
+
 SOURCES_FILE = ".icrtool-files"
 """File in a run with the absolute paths of the files that the run was made from. run.json holds the paths as given."""
 
@@ -222,7 +225,7 @@ def read_sums(directory: Path) -> dict[str, str]:
         The list of sums cannot be read.
     """
     try:
-        lines = read_regular(directory / CHECKSUM_FILE, directory).decode().splitlines()
+        lines = read_regular(directory / CHECKSUM_FILE, directory, LARGEST_SUMS_BYTES).decode().splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise RunError(directory, f"no readable {CHECKSUM_FILE}", "fit the log again") from err
     return {name: sum_ for sum_, _, name in (line.partition("  ") for line in lines)}

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import subprocess
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.errors import OutputError
+from icrtool.errors import OutputError, RunError
 from icrtool.output import figure_catalogue as catalogue
 from icrtool.output.dropout_directory import write_report
 from icrtool.output.files import run_columns
@@ -94,6 +95,18 @@ def listed(directory: Path) -> set[str]:
     sums = read_sums(directory)
     assert {name: file_b2sum(directory / name) for name in sums} == sums
     return set(sums)
+
+
+def test_a_list_of_sums_of_60_megabytes_is_refused_unread(tmp_path: Path) -> None:
+    """A sparse file costs its sender nothing; decoded and split it took 256 MB."""
+    with (tmp_path / "B2SUMS").open("wb") as file:
+        file.truncate(60 << 20)
+    tracemalloc.start()
+    with pytest.raises(RunError, match="no readable B2SUMS"):
+        read_sums(tmp_path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 << 20
 
 
 def test_the_list_of_a_run_names_its_report_too_and_is_true_at_every_moment(written: Path, run: Run) -> None:
