@@ -90,12 +90,14 @@ def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGE
         As `open_regular`; the file is larger than `most_bytes`.
     """
     with open_regular(path, inside) as file:
-        # the size of the file, not the limit: this is the memory that is allocated
-        size = min(os.fstat(file.fileno()).st_size, most_bytes)
-        content = file.read(size + 1)
-        while len(content) <= most_bytes and (more := file.read(min(_READ_ON_BYTES, most_bytes + 1 - len(content)))):
+        # the size of the file, not the limit: this is the memory that is allocated; a sparse file is refused unread
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(size + 1) if size <= most_bytes else b""
+        while max(size, len(content)) <= most_bytes and (
+            more := file.read(min(_READ_ON_BYTES, most_bytes + 1 - len(content)))
+        ):
             content += more
-    if len(content) > most_bytes:
+    if max(size, len(content)) > most_bytes:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
     return content
 
