@@ -99,7 +99,8 @@ def _with_turned_heading(log: RobotLog) -> RobotLog:
         if np.count_nonzero(finite) < FEWEST_OVERLAPPING or not np.ptp(apart[finite]) > 0.0:
             continue
         stamps, rate, apart = gyro.stamp_ns[finite], rate[finite], apart[finite]
-        _, bias = np.polyfit(apart, rate, 1)
+        # of equal differences, as of a robot that drives straight, the least norm is taken
+        bias = np.linalg.lstsq(np.column_stack([apart, np.ones(len(apart))]), rate)[0][1]
         heading = trapezoids((stamps - stamps[0]) / 1e9, rate - bias)
         if np.ptp(heading) > LEAST_GYRO_TURN_RAD:
             return replace(log, heading=HeadingSamples(stamps, wrapped(heading), np.full(len(stamps), np.nan)))

@@ -68,6 +68,7 @@ def season(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "script.py").write_text(SCRIPT)
     monkeypatch.setattr(processes, "PROCESS_COMMAND", (sys.executable, str(tmp_path / "script.py")))
     (tmp_path / "season").mkdir()
+    processes.close_all()  # those that another file's batch left waiting
     yield tmp_path / "season"
     processes.close_all()
 
@@ -116,8 +117,8 @@ def test_a_log_that_hangs_is_ended(season: Path) -> None:
     assert time.monotonic() - begun < 40
     assert {row.log: row.status for row in rows} == {"hang.mcap": "failed", "a.mcap": "done"}
     assert {row.log: row.usable for row in rows} == {"hang.mcap": False, "a.mcap": True}
-    assert all(row.took_s >= 4.0 for row in rows if "longer than 4 s" in row.reason)
-    assert any("longer than 4 s" in row.reason for row in rows)
+    assert all(row.took_s >= 10.0 for row in rows if "longer than 10 s" in row.reason)
+    assert any("longer than 10 s" in row.reason for row in rows)
 
 
 def test_what_is_done_is_skipped_until_input_configuration_or_request_change(season: Path) -> None:
