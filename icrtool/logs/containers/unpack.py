@@ -488,7 +488,8 @@ def _zip_entries(file: BufferedReader, budget: _Budget) -> Iterator[tuple[str, _
     try:
         with zipfile.ZipFile(_FrugalFile(file)) as archive:
             for info in archive.infolist()[:_MOST_ENTRIES]:
-                if info.is_dir():
+                # a file has a name; `is_dir` of Python 3.11 looks at its last letter
+                if not info.filename or info.is_dir():
                     continue
                 if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2}:
                     budget.stop(

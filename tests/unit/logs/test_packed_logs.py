@@ -127,6 +127,21 @@ def test_a_log_in_a_zip_archive_is_read_compressed_again_or_not(tmp_path, method
         assert content(path) == content(MCAP)
 
 
+def test_an_entry_without_a_name_in_a_zip_archive_costs_no_other_entry(tmp_path):
+    path = tmp_path / "nameless.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("x", b"no log")
+        archive.writestr("a.mcap", MCAP.read_bytes())
+    data = bytearray(path.read_bytes())
+    for mark, at in ((b"PK\x03\x04", 26), (b"PK\x01\x02", 28)):
+        # the name becomes a further field of one byte
+        place = data.index(mark) + at
+        data[place : place + 4] = b"\x00\x00\x01\x00"
+    path.write_bytes(data)
+    assert zipfile.ZipFile(path).namelist() == ["", "a.mcap"]
+    assert content(path) == content(MCAP)
+
+
 def test_a_bag_directory_whose_files_are_compressed_is_read_from_an_archive(tmp_path):
     path = tmp_path / "x.tar"
     metadata = (DIRECTORY / "metadata.yaml").read_bytes().replace(b".db3", b".db3.zstd")
