@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -25,20 +23,12 @@ from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog
 from icrtool.records.text import LogText
 from support.barn import configured, simulate
 from support.documents import with_summary
+from support.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def load_script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("schemas", ROOT / "scripts" / "schemas.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-SCRIPT = load_script()
+SCRIPT = load_script("schemas")
 
 
 @pytest.fixture(scope="module")

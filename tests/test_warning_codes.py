@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from icrtool.records.note_catalogue import CATALOGUE, GROUPS
+from support.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "icrtool"
@@ -160,11 +160,7 @@ def test_each_explanation_is_of_whole_sentences() -> None:
 
 
 def test_the_page_of_warnings_is_that_of_the_catalogue() -> None:
-    spec = importlib.util.spec_from_file_location("warning_codes", ROOT / "scripts" / "warning_codes.py")
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    script = load_script("warning_codes")
     page = script.PAGE.read_text(encoding="utf-8")
     assert page == script.page(), "run make schemas"
     assert re.findall(r"^### `(\w+)`$", page, re.MULTILINE) == list(CATALOGUE)

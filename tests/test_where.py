@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from support.scripts import load_script
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = '''"""Sliding of wheels on ice."""
@@ -36,12 +37,7 @@ def drift(x):
 
 @pytest.fixture(scope="module")
 def where() -> Any:
-    spec = importlib.util.spec_from_file_location("where", ROOT / "scripts" / "where.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("where")
 
 
 def test_what_a_module_defines_is_listed_with_its_line_and_first_line(where: Any) -> None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 from icrtool.errors import ConfigError
 
@@ -19,6 +20,8 @@ nothing."""
 
 QUIET_S = 15.0
 """Longest time in which a server may send nothing, where nothing else is set [s]."""
+
+Limit = TypeVar("Limit", int, float)
 
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
@@ -63,10 +66,7 @@ def most_bytes() -> int | None:
     ConfigError
         The environment states no number of bytes.
     """
-    try:
-        return bytes_in(text) if (text := os.environ.get(MOST_BYTES)) else None
-    except ValueError as err:
-        raise ConfigError(MOST_BYTES, str(err)) from None
+    return _of_environment(MOST_BYTES, bytes_in)
 
 
 def server_timeout_s() -> float:
@@ -77,10 +77,18 @@ def server_timeout_s() -> float:
     ConfigError
         The environment states no number of seconds.
     """
+    stated_s = _of_environment(SERVER_TIMEOUT_S, seconds_in)
+    return QUIET_S if stated_s is None else stated_s
+
+
+def _of_environment(variable: str, parse: Callable[[str], Limit]) -> Limit | None:
+    """Return the limit that an environment variable states; None where it states nothing."""
+    if not (text := os.environ.get(variable)):
+        return None
     try:
-        return seconds_in(text) if (text := os.environ.get(SERVER_TIMEOUT_S)) else QUIET_S
+        return parse(text)
     except ValueError as err:
-        raise ConfigError(SERVER_TIMEOUT_S, str(err)) from None
+        raise ConfigError(variable, str(err)) from None
 
 
 @contextmanager
