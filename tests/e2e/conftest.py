@@ -11,8 +11,9 @@ from icrtool.cli import main
 from support.batches import in_this_process
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def batches_in_this_process():
+    """Of the scope of a module: files of other folders, which the same process tests next, test the real processes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
         yield

@@ -68,7 +68,6 @@ def season(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "script.py").write_text(SCRIPT)
     monkeypatch.setattr(processes, "PROCESS_COMMAND", (sys.executable, str(tmp_path / "script.py")))
     (tmp_path / "season").mkdir()
-    processes.close_all()  # those that another file's batch left waiting
     yield tmp_path / "season"
     processes.close_all()
 
