@@ -37,10 +37,11 @@ BRIEF, VERBOSE, PAGE = 0, 1, 2
 
 
 class Title(NamedTuple):
-    """Subject of a document, and the amount of data behind it."""
+    """Subject of a document, and the amount of data behind it; `about`: a sentence that only a wide page shows."""
 
     text: str
     facts: str
+    about: str = ""
 
 
 class Line(NamedTuple):

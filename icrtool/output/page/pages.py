@@ -130,7 +130,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     meanings = {name: f"{row.words}; learned from {row.knows}" for name, row in rows.items()}
     words = Section("ICR, recommended, no_slip, trial, σ …", [Facts(list((meanings | GLOSSARY).items()))], PAGE)
     blocks = [
-        Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {about}"),
+        Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}.", about),
         *page_blocks(summary, stated),
         Section("Log and settings", [streams_section(summary), *_settings(summary), made_from], name="log"),
         Section("Words on this page", [words], name="words"),
@@ -162,7 +162,7 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     ]  # fmt: skip
     warnings = [one.text for one in summary.notes if not is_grave(one)]
     return [
-        unusable_line(summary), Facts([("next", advice(summary))]),
+        unusable_line(summary), *(f"What to do: {one}" for one in (advice(summary),) if one),
         Section("Answer", _cards(summary, report), name="answer"),
         controller_section(report),
         Section("The drive", drive, name="drive"),

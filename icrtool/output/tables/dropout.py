@@ -164,9 +164,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows, others = reach_rows(report, budget_m, len(summary.events))
         if rows and not lead:
-            name, lead, next_drive, _ = rows[0]
-            then = f"; on the next drive on this ground {next_drive} (9 of 10)" if next_drive else ""
-            text = f"within {budget_m:g} m (95 %) on this drive, by wheel speeds alone with {name}{then}"
+            lead, text = _distance_to_plan_with(report, budget_m, rows[0])
             text += "".join(f"; {line}" for line in (*others_known[:1], *heading_lines(report)))
         shown = [(shortened(name, LONGEST_ROW_NAME), *rest) for name, *rest in rows]
         head = (f"within {budget_m:g} m (95 %)", "this drive", NEXT_DRIVE, "")
@@ -180,6 +178,21 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
         blocks.append(Facts([("left out", f"recommended, controller: {report.ladder.left_out}")]))
     return Section("How far without GNSS?", blocks, lead=lead, text=text, name="reach")
+
+
+def _distance_to_plan_with(report: DropoutDocument, budget_m: float, row: ReachRow) -> tuple[str, str]:
+    """Return the distance that the next drive keeps in 9 of 10 cases, and in a sentence the distance on this drive.
+
+    Where nothing is expected of the next drive, the distance on this drive is the answer.
+    """
+    name, this_drive, next_drive, _ = row
+    measured = f"within {budget_m:g} m (95 %), by wheel speeds alone with {name}"
+    found = next((one for one in report.budgets if (one.model, one.budget_m) == (name, budget_m)), None)
+    if found is None or not next_drive:
+        return this_drive, f"on this drive {measured}"
+    sure_m = found.distance_m if found.next_low_m is None else found.next_low_m
+    then = f"{next_drive} on the next drive on this ground (9 of 10), {this_drive} on this drive"
+    return f"plan with {distance_text(sure_m)}", f"{measured}: {then}"
 
 
 def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
@@ -264,7 +277,11 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
     moments = [one.t_s for one in report.worst]
     worst = Table("lrrrrrrrl", rows[:1], head, caption, moments[:1])
     further = Table("lrrrrrrrl", rows[1:], head, "", moments[1:])
-    blocks: list[Block] = [worst, Section(f"The next {len(rows) - 1}", [further], PAGE), Figure(("error_map", "worst"))]
+    blocks: list[Block] = [
+        worst,
+        Section(f"The next {len(rows) - 1}", [further], PAGE),
+        Figure(("error_map", "worst"), folded=False),
+    ]
     return Section("Worst cases", blocks, PAGE, name="worst")
 
 
