@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from icrtool.records.text import LONGEST_MESSAGE, LONGEST_NAME, escaped, shortened
+from icrtool.records.text import LONGEST_MESSAGE, LONGEST_NAME, LONGEST_STORED, escaped, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -22,7 +22,8 @@ class IcrToolError(Exception):
         self.what = what
         self.why = why
         self.advice = advice
-        super().__init__(_line(f"{what}: {self.reason}"))
+        # an address of any length leaves space for the reason
+        super().__init__(_line(f"{shortened(str(what), LONGEST_STORED)}: {self.reason}"))
 
     @property
     def reason(self) -> str:

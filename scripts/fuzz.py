@@ -1,4 +1,4 @@
-"""Fuzz icrtool with damaged logs and forged runs: each is used within bounds of time and memory, without a warning.
+"""Fuzz icrtool with damaged logs, forged runs and odd addresses: each is used within bounds of time and memory.
 
 ``make fuzz`` runs it; ``python scripts/fuzz.py --help`` lists the options. A finding is a traceback or a limit that
 is exceeded; its log is kept below ``--keep`` with the traceback beside it. Logs are used in worker processes, which
@@ -27,8 +27,9 @@ import warnings
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from functools import cache
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from functools import cache, partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -39,7 +40,8 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
 
-import fuzz_runs  # noqa: E402 - beside this script
+import fuzz_addresses  # noqa: E402 - beside this script
+import fuzz_runs  # noqa: E402
 import fuzz_schemas  # noqa: E402
 import fuzz_structures  # noqa: E402
 
@@ -416,39 +418,60 @@ def load_all() -> None:
         shutil.rmtree(folder)
 
 
-Job = tuple[int, bool, float, int, str, bool, str]
+@dataclass(frozen=True)
+class Job:
+    """What a worker makes and uses.
+
+    Attributes
+    ----------
+    seed : what is made of it is the same each time
+    whole : whether a log is also fitted and reported
+    seconds, megabytes : CPU time and memory that it may take; a log takes more by its size
+    keep : directory for findings; empty: none
+    measure : whether functions that are reached are recorded
+    runs : folder with a run that is forged; None: a log is made
+    port : of the web server of addresses; 0: no address is made
+    """
+
+    seed: int
+    whole: bool
+    seconds: float
+    megabytes: int
+    keep: str
+    measure: bool
+    runs: Path | None
+    port: int
+
+
 Result = tuple[int, str, list[str], str, float, set[str]]
 
 
-def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
+def work(job: Job, begun: Callable[[float], None] = lambda _: None) -> Result:
     """Make and use one log in this process; return seed, outcome, mutations, traceback, CPU seconds and functions.
 
-    `begun` is called when it is made.
+    `begun` is called with the CPU seconds that it may take, when it is made.
     """
-    seed, whole, seconds, megabytes, keep, measure, runs = job
+    seed, seconds, megabytes, keep = job.seed, job.seconds, job.megabytes, job.keep
     folder = Path(tempfile.mkdtemp(dir=scratch()))
     reached: set[str] = set()
     done: list[str] = []
     outcome, text = "", ""
     began = time.process_time()
     try:
-        if runs:
-            home, done, command = fuzz_runs.make_run(folder, Path(runs), seed)
-        else:
-            path, done = make_log(folder, np.random.default_rng(seed))
-            seconds += bytes_of(path) / BYTES_A_SECOND
-            megabytes += int(MEMORY_A_BYTE * bytes_of(path) / 1e6)
+        use_it, done, size = made(job, folder)
+        seconds += size / BYTES_A_SECOND
+        megabytes += int(MEMORY_A_BYTE * size / 1e6)
         before = peak_kilobytes(anew=True)
         began = time.process_time()
-        begun()
+        begun(seconds)
         signal.signal(signal.SIGPROF, too_long)
         signal.setitimer(signal.ITIMER_PROF, seconds)
-        if measure:
+        if job.measure:
             sys.setprofile(lambda frame, event, _: reached.add(where(frame)) if event == "call" else None)
         with warnings.catch_warnings():
             # A warning of a library prints lines of code to whoever uses the log.
             warnings.simplefilter("error")
-            outcome = fuzz_runs.use_run(folder, home, command) if runs else use(path, whole=whole)
+            outcome = use_it()
         grown = (peak_kilobytes() - before) / 1024
         if grown > megabytes:
             outcome, text = "FOUND", f"{grown:.0f} MB"
@@ -464,11 +487,31 @@ def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
     if outcome == "FOUND" and keep:
         place = Path(keep) / str(seed)
         place.mkdir(parents=True, exist_ok=True)
-        if not runs:  # a forged run leads to devices without end; its seed makes it again
+        if job.runs is None:  # a forged run leads to devices without end; its seed makes it again
             shutil.copytree(folder, place, dirs_exist_ok=True)
         (place / "finding.txt").write_text(f"{done}\n{text}", encoding="utf-8", errors="replace")
     shutil.rmtree(folder, ignore_errors=True)
     return seed, outcome, done, text, used, reached
+
+
+def made(job: Job, folder: Path) -> tuple[Callable[[], str], list[str], int]:
+    """Make what a job asks for; return what uses it, what was done, and its size beyond what anything may take."""
+    if job.runs is not None and job.port:
+        inner = folder / "in"
+        inner.mkdir()
+        address, command = fuzz_addresses.make_case(inner, job.runs / "run", address_log(), job.seed, job.port)
+        done = [command[0], repr(address.text[:300])]
+        return partial(fuzz_addresses.use_address, inner, address, command, job.port), done, 0
+    if job.runs is not None:
+        home, done, command = fuzz_runs.make_run(folder, job.runs, job.seed)
+        return partial(fuzz_runs.use_run, folder, home, command), done, 0
+    path, done = make_log(folder, np.random.default_rng(job.seed))
+    return partial(use, path, whole=job.whole), done, bytes_of(path)
+
+
+def address_log() -> Path:
+    """Return the log that lies at addresses."""
+    return clean_log(COUNTS[-1], 0, "joint_states") / "log.mcap"
 
 
 def peak_kilobytes(*, anew: bool = False) -> int:
@@ -515,7 +558,7 @@ def serve(connection: Connection, megabytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, ((megabytes + 4000) << 20,) * 2)
     gc.set_threshold(100_000)
     while (job := connection.recv()) is not None:
-        connection.send(work(job, lambda: connection.send(None)))
+        connection.send(work(job, connection.send))
 
 
 RENEWED = 500
@@ -526,6 +569,9 @@ BYTES_A_SECOND, MEMORY_A_BYTE = 1e6, 50
 
 RUN_SECONDS = 20.0
 """CPU time of a command on a forged run, with its start-up; --baseline and batch fit or read several."""
+
+MAKING_SECONDS = 60.0
+"""CPU time in which the fuzzer makes a log."""
 
 WALL_FACTOR = 200
 """A worker that gets no share of the processor is no finding; one that waits is ended after this many limits."""
@@ -542,16 +588,17 @@ class Worker:
         theirs.close()
         self.job: Job | None = None
         self.left = RENEWED
-        self.cpu_s, self.wall_s = 0.0, 0.0
+        self.cpu_s, self.wall_s, self.most_s = 0.0, 0.0, MAKING_SECONDS
 
     def give(self, job: Job) -> None:
         """Have it use a log."""
         self.job, self.left = job, self.left - 1
-        self.mark()
+        self.mark(MAKING_SECONDS)
         self.connection.send(job)
 
-    def mark(self) -> None:
-        """Count time from here."""
+    def mark(self, most_s: float) -> None:
+        """Count time from here, with the CPU seconds that may pass."""
+        self.most_s = most_s
         self.cpu_s, self.wall_s = self.cpu(), time.monotonic()
 
     def cpu(self) -> float:
@@ -566,22 +613,22 @@ class Worker:
         """Return what became of the log; None where nothing is known yet."""
         if self.job is None:
             return None
-        seconds = self.job[2]
         if not self.connection.poll():
             used = self.cpu() - self.cpu_s
-            if used < 2 * seconds and time.monotonic() - self.wall_s < WALL_FACTOR * seconds:
+            if used < 2 * self.most_s and time.monotonic() - self.wall_s < WALL_FACTOR * self.most_s:
                 return None
             self.end()
-            return self.job[0], "FOUND", [], f"killed after {used:.1f} s CPU", used, set()
+            return self.job.seed, "FOUND", [], f"killed after {used:.1f} s CPU", used, set()
         try:
-            answer: Result | None = self.connection.recv()
+            answer: Result | float = self.connection.recv()
         except EOFError:
             self.process.join()
             code = self.process.exitcode
             self.end()
-            return self.job[0], "FOUND", [], f"process died ({code})", 0.0, set()
-        if answer is None:
-            self.mark()
+            return self.job.seed, "FOUND", [], f"process died ({code})", 0.0, set()
+        if isinstance(answer, float):
+            self.mark(answer)
+            return None
         return answer
 
     def end(self) -> None:
@@ -620,6 +667,7 @@ def main() -> int:
     parser.add_argument("--logs", type=int, default=2000, help="logs that are made and read")
     parser.add_argument("--fitted", type=int, default=10, help="one of so many is also fitted and reported")
     parser.add_argument("--runs", type=int, default=0, help="forged runs that are made and used, in place of logs")
+    parser.add_argument("--addresses", type=int, default=0, help="odd addresses that are used, in place of logs")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=2.0, help="CPU time a log may take, and 1 s for each MB")
@@ -628,15 +676,32 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=0.0, help="stop after this time; default: never")
     parser.add_argument("--keep", default="", help="directory for the logs of findings")
     given = parser.parse_args()
-    seeds = range(given.first, given.first + (given.runs or given.logs))
-    source = str(fuzz_runs.made(scratch())) if given.runs else ""
-    seconds = RUN_SECONDS if given.runs else given.seconds
-    jobs: Iterator[Job] = (
-        (seed, seed % given.fitted == 0, seconds, given.megabytes, given.keep, seed % given.coverage == 0, source)
-        for seed in seeds
-    )
+    with ExitStack() as serving:
+        return fuzz(given, serving)
+
+
+def fuzz(given: argparse.Namespace, serving: ExitStack) -> int:
+    """Fuzz as the options state; `serving` closes what is served to the workers."""
+    seeds = range(given.first, given.first + (given.addresses or given.runs or given.logs))
+    commands = bool(given.runs or given.addresses)
+    source = fuzz_runs.made(scratch()) if commands else None
+    seconds = RUN_SECONDS if commands else given.seconds
     # What every command loads once is outside the limits.
     load_all()
+    port = serving.enter_context(fuzz_addresses.servers(address_log())) if given.addresses else 0
+    jobs: Iterator[Job] = (
+        Job(
+            seed,
+            seed % given.fitted == 0,
+            seconds,
+            given.megabytes,
+            given.keep,
+            seed % given.coverage == 0,
+            source,
+            port,
+        )
+        for seed in seeds
+    )
     counts: Counter[str] = Counter()
     kinds: Counter[str] = Counter()
     reached: set[str] = set()
@@ -645,7 +710,7 @@ def main() -> int:
     # Forked workers share the kernels and the clean logs.
     for seed, outcome, done, text, used, names in use_all(jobs, given.jobs, given.megabytes):
         counts[outcome] += 1
-        kinds.update(one.split(" ")[0] if len(one) > 30 else one for one in done)
+        kinds.update(one.split(" ")[0] if len(one) > 30 else one for one in done[: 1 if given.addresses else None])
         reached |= names
         slowest = max(slowest, (used, seed))
         if outcome == "FOUND":
@@ -653,7 +718,7 @@ def main() -> int:
             if given.keep and not (Path(given.keep) / str(seed)).exists():
                 place = Path(given.keep) / str(seed)
                 place.mkdir(parents=True)
-                if not given.runs:
+                if not commands:
                     make_log(place, np.random.default_rng(seed))
         if given.minutes and time.monotonic() - begun > 60 * given.minutes:
             print(f"stopped after {given.minutes:g} minutes; go on with --first {max(seed, given.first) + 1}")

@@ -132,7 +132,7 @@ def called(arguments: list[str], folder: Path) -> tuple[int, str, str]:
     """Call a command in this process; return its status and what it printed."""
     from icrtool.cli import _run
 
-    output, errors = io.StringIO(), io.StringIO()
+    output, errors = (io.TextIOWrapper(io.BytesIO(), "utf-8", "replace", write_through=True) for _ in range(2))
     before = Path.cwd()
     os.chdir(folder)
     try:
@@ -144,4 +144,5 @@ def called(arguments: list[str], folder: Path) -> tuple[int, str, str]:
             status = _run()
     finally:
         os.chdir(before)
-    return status, output.getvalue(), errors.getvalue()
+    said, said_of_errors = (stream.buffer.getvalue().decode() for stream in (output, errors))  # type: ignore[attr-defined]
+    return status, said, said_of_errors

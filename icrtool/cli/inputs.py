@@ -174,7 +174,7 @@ def named_place(source: str) -> tuple[LogText, Path]:
     whole = place_of(source)
     name, sign, place = source.partition("=")
     # An address may have an equals sign in its query.
-    if sign and name and place and not isinstance(whole, UrlPath) and not whole.exists():
+    if sign and name and place and not isinstance(place_of(name), UrlPath) and not whole.exists():
         return LogText(name), place_of(place)
     return LogText(whole.name or str(whole)), whole
 

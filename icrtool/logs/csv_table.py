@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
@@ -23,6 +24,9 @@ MOST_EMPTY, LEAST_CELLS = 4, 1_000_000
 column of each row, and rows of two bytes below thousands of names would fill the memory."""
 
 _COUNTED_BYTES = 1 << 20
+
+MORE_VALUES = "its rows have more values than its first line has names"
+"""Why a table is refused whose columns cannot be told apart."""
 
 
 class TableForm(NamedTuple):
@@ -76,16 +80,22 @@ def csv_frame(path: Path) -> pd.DataFrame:
         if form.columns > MOST_COLUMNS:
             raise ValueError(f"its first line has more than {MOST_COLUMNS} columns")
         if _count(first, form) > _count(head, form):
-            raise ValueError("its rows have more values than its first line has names")
+            raise ValueError(MORE_VALUES)
         _check_cells(stream, form)
     parts, names = [], list[object]()
-    with pd.read_csv(
-        path, skipinitialspace=form.separator != "\t", sep=form.separator, decimal=form.decimal, encoding="utf-8-sig",
-        index_col=False, compression=None, chunksize=CELLS_AT_ONCE // form.columns,
-    ) as reader:  # fmt: skip
-        for part in reader:
-            names = names or list(part.columns)
-            parts.append(part[[column for column in part.columns if column in TABLE_COLUMNS]])
+    with warnings.catch_warnings():
+        # It warns where rows have more values than the first line has names, and drops what is beyond.
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        try:
+            with pd.read_csv(
+                path, skipinitialspace=form.separator != "\t", sep=form.separator, decimal=form.decimal,
+                encoding="utf-8-sig", index_col=False, compression=None, chunksize=CELLS_AT_ONCE // form.columns,
+            ) as reader:  # fmt: skip
+                for part in reader:
+                    names = names or list(part.columns)
+                    parts.append(part[[column for column in part.columns if column in TABLE_COLUMNS]])
+        except pd.errors.ParserWarning:
+            raise ValueError(MORE_VALUES) from None
     table = pd.concat(parts, ignore_index=True) if len(parts) > 1 else parts[0] if parts else pd.DataFrame()
     table.attrs.update(form=form.text, names=names)
     return table

@@ -69,7 +69,7 @@ def survey_log(
         The log cannot be opened, or was written to while it was read.
     """
     config = config if config is not None else Config()
-    path = place_of(path) if isinstance(path, str) else path
+    path = place_of(path)
     begin, stop = moment(start, "start"), moment(end, "end")
     before = states_of(path)
     ended = Event()
@@ -123,7 +123,7 @@ def read_log(
         Streams without usable samples.
     """
     config = config if config is not None else Config()
-    path = place_of(path) if isinstance(path, str) else path
+    path = place_of(path)
     if is_table(path):
         return read_table(path, start, end)
     return assemble(survey_log(path, config, progress, start=start, end=end), config)

@@ -80,7 +80,7 @@ def read_topic_poses(path: str | Path, topics: Sequence[str], progress: Progress
     DataError
         A topic holds fewer than two poses.
     """
-    path = place_of(path) if isinstance(path, str) else path
+    path = place_of(path)
     if is_table(path):
         raise ConfigError("score", f"{path} is a table, which has no topics", "name a bag or MCAP file")
     with contextlib.closing(open_log(path, progress)) as container:

@@ -307,7 +307,7 @@ def open_run(path: str | Path, *, whole: bool = True) -> Run:
     OutputError
         The address cannot be read.
     """
-    place = place_of(path) if isinstance(path, str) else path
+    place = place_of(path)
     with on_disk(place, lambda name: "/" not in name, writes=False) as directory:
         return _run_in(directory, place, whole=whole or directory is not place)
 

@@ -34,10 +34,14 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 NOT_REGULAR = "not a regular file"
 SAVE_IT = "save what it gives to a file, and name that"
 
-_URL = re.compile(r"^([a-z][a-z0-9+.-]+)://", re.IGNORECASE)
+_URL = re.compile(r"^([a-z][a-z0-9+.-]+)://(?!/)", re.IGNORECASE)
 SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "http", "https")
 """The kinds of addresses that are read: object stores and web servers. Others reach files and devices of this machine,
 its memory, or programs (``file``, ``memory``, ``github``, chains with ``::``)."""
+
+_MEANT = re.compile(rf"\b(?:([a-z][a-z0-9+.-]+):[/\\]{{2}}|({'|'.join(SCHEMES)}):[/\\])", re.IGNORECASE)
+"""What shows that a text is meant as an address, though something stands before it or a slash is missing. Such a text
+has passwords and tokens too."""
 
 _LEAST_SECRET = 4
 """Length of the shortest secret that is removed from texts of libraries, in characters."""
@@ -163,7 +167,7 @@ class UrlPath(_LocalPath):
     @property
     def scheme(self) -> str:
         """What stands before ``://``."""
-        return self._url.partition("://")[0].lower()
+        return _parts(self._url)[0].lower()
 
     @property
     def parent(self) -> Path:  # type: ignore[override]  # of any path
@@ -176,8 +180,9 @@ class UrlPath(_LocalPath):
 
     def __truediv__(self, name: object) -> Self:
         """Return the address of what lies below it."""
-        place, mark, query = self._url.partition("?") if self.scheme.startswith("http") else (self._url, "", "")
-        return type(self)(f"{place.rstrip('/')}/{PurePosixPath(str(name)).as_posix()}{mark}{query}")
+        behind = _parts(self._url)[3] if self.scheme.startswith("http") else ""
+        place = self._url.removesuffix(behind) or self._url
+        return type(self)(f"{place.rstrip('/')}/{PurePosixPath(str(name)).as_posix()}{behind}")
 
     def absolute(self) -> Self:
         """Return itself."""
@@ -198,6 +203,8 @@ class UrlPath(_LocalPath):
 
     def problem(self) -> str:
         """Return in words why the address cannot be read; empty where it can."""
+        if not _URL.match(self._url):
+            return "it does not begin with a kind of address, :// and a host or a bucket"
         if "::" in self._url.partition("?")[0]:
             return "chains with :: are not read"
         if self.scheme not in SCHEMES:
@@ -227,13 +234,17 @@ class UrlPath(_LocalPath):
     is_file = is_dir = is_symlink = exists
 
 
-def place_of(text: str) -> Path:
-    """Return what a user named: an address as `UrlPath`, anything else as a path."""
-    return UrlPath(text) if _URL.match(text) else Path(text)
+def place_of(named: str | Path) -> Path:
+    """Return what a user named: an address as `UrlPath`, also one that is not written well; else a path."""
+    text = os.fspath(named)
+    return UrlPath(text) if _MEANT.search(text) else Path(text)
 
 
 def _parts(url: str) -> tuple[str, str, str, str]:
     """Return the parts of an address: scheme, user and password, the part that is shown, and the rest."""
+    if not _URL.match(url):
+        meant = _MEANT.search(url)
+        return (meant[1] or meant[2] if meant is not None else ""), "", "…", url
     scheme, _, rest = url.partition("://")
     is_web, first = scheme.lower().startswith("http"), rest.partition("/")[0]
     known, mark, host = first.rpartition("@")
@@ -249,7 +260,7 @@ def _parts(url: str) -> tuple[str, str, str, str]:
 
 def without_secrets(url: str) -> str:
     """Return an address without user, password and query, where tokens and signatures stand; other texts unchanged."""
-    if "://" not in url:
+    if not _MEANT.search(url):
         return url
     scheme, _, shown, _ = _parts(url)
     return f"{scheme}://{shown}"

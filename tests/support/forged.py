@@ -204,7 +204,7 @@ def document(place: Path, home: Home, random: Random) -> str:
         if not is_small(path):
             return f"{path.name}: forged already"
         plain = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):  # brackets within brackets, of an earlier forgery
         return f"{path.name}: gone"
     every = random.randrange(40, 200)
     choices = list(edited(plain, every)) if isinstance(plain, dict) else []

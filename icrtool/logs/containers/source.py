@@ -29,7 +29,7 @@ from icrtool.logs.containers.recording_files import LOG_SUFFIXES, natural_order,
 from icrtool.records.input_limits import most_bytes, server_timeout_s
 from icrtool.records.places import LARGEST_DOCUMENT_BYTES, SCHEMES, UrlPath, place_of, without_secrets
 from icrtool.records.samples import InputFile
-from icrtool.records.text import LONGEST_NAME
+from icrtool.records.text import LONGEST_NAME, LONGEST_STORED, shortened
 
 Result = TypeVar("Result")
 
@@ -44,7 +44,7 @@ _NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adl
           "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
 """The library that each kind of address is read with."""
 
-_LOGGERS = ("fsspec", "s3fs", "aiobotocore", "botocore", "gcsfs", "google", "adlfs", "azure", "aiohttp")
+_LOGGERS = ("fsspec", "s3fs", "aiobotocore", "botocore", "gcsfs", "google", "adlfs", "azure", "aiohttp", "asyncio")
 
 PAUSES_S = (0.5, 2.0)
 """Pauses before a request to a web server is repeated [s]; the libraries of object stores repeat requests
@@ -79,9 +79,8 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
     extra = "http" if needed == "aiohttp" else "cloud"
     try:
         import fsspec
-        from fsspec.core import url_to_fs
 
-        fsspec.get_filesystem_class(path.scheme)
+        kind: Any = fsspec.get_filesystem_class(path.scheme)
     except ImportError as err:
         raise LogError(path, f"needs {needed or err}", f"pip install 'icrtool[{extra}]'") from err
     for name in _LOGGERS:
@@ -89,7 +88,10 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
         if (logger := logging.getLogger(name)).level == logging.NOTSET:
             logger.setLevel(logging.CRITICAL + 1)
     try:
-        found: tuple[Any, str] = asked(path, lambda: url_to_fs(path.url, **_patience(path.scheme)))
+        # `url_to_fs` of fsspec would follow chains with ::, also behind a question mark
+        address = path.scheme + path.url[len(path.scheme) :]
+        settings = asked(path, lambda: {**kind._get_kwargs_from_urls(address), **_patience(path.scheme)})  # noqa: SLF001 - as it does
+        found: tuple[Any, str] = asked(path, lambda: (kind(**settings), kind._strip_protocol(address)))  # noqa: SLF001
     except (KeyError, IndexError, TypeError, AttributeError, NotImplementedError) as err:
         raise LogError(path, "is no address that can be read", type(err).__name__) from None
     return found
@@ -102,7 +104,9 @@ def _patience(scheme: str) -> dict[str, Any]:
         from aiohttp import ClientTimeout
 
         timeout = ClientTimeout(total=None, sock_connect=quiet_s, sock_read=quiet_s)
-        return {"client_kwargs": {"timeout": timeout, "response_class": _short_pages()}}
+        return {
+            "client_kwargs": {"timeout": timeout, "response_class": _short_pages(), "trace_configs": [_redirects()]}
+        }
     if scheme.startswith("s3"):
         return {"config_kwargs": {"connect_timeout": quiet_s, "read_timeout": quiet_s, "retries": {"max_attempts": 1}}}
     return {}
@@ -126,6 +130,39 @@ def _short_pages() -> type[Any]:
             return self._body
 
     return ShortPage
+
+
+@cache
+def _redirects() -> Any:  # noqa: ANN401 - of a library
+    """Return what looks at the redirects of web servers, and refuses those that `_check_redirect` refuses."""
+    from aiohttp import TraceConfig
+    from yarl import URL
+
+    async def look(_: object, __: object, redirect: Any) -> None:  # noqa: ANN401 - of a library
+        headers = redirect.response.headers
+        target = redirect.url.join(URL(headers.get("Location") or headers.get("URI") or ""))
+        await _check_redirect(redirect.url, target)
+
+    looking = TraceConfig()
+    looking.on_request_redirect.append(look)
+    return looking
+
+
+async def _check_redirect(url: Any, target: Any) -> None:  # noqa: ANN401 - addresses of a library
+    """Refuse a redirect from https to another scheme, or to another host that has no public address.
+
+    A server could else have a command read from a machine that only this one reaches.
+    """
+    import asyncio
+    from ipaddress import ip_address
+
+    if target.scheme not in {url.scheme, "https"}:
+        raise ValueError(f"its server redirects from {url.scheme}:// to {target.scheme[:LONGEST_NAME]}://")
+    if target.host == url.host:
+        return
+    found = await asyncio.get_running_loop().getaddrinfo(target.host, target.port)
+    if not all(ip_address(str(one[4][0]).partition("%")[0]).is_global for one in found):
+        raise ValueError(f"its server redirects to {target.host}, which has no public address")
 
 
 def _in_time(files: Any, method: str, *given: object, expected_bytes: int = 0, **named: object) -> Any:  # noqa: ANN401 - of a library
@@ -188,7 +225,7 @@ def _words_of(cause: BaseException, path: UrlPath) -> str:
     if isinstance(status, int):
         # the rest of such a text is the address, or another address to which the server redirected
         return f"its server answered {status} {getattr(cause, 'message', '')}".strip()
-    return path.without_own_secrets(str(cause)) or type(cause).__name__
+    return shortened(path.without_own_secrets(str(cause)), LONGEST_STORED) or type(cause).__name__
 
 
 def _failures() -> tuple[type[Exception], ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import re
 import shutil
@@ -16,12 +17,15 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.errors import ConfigError, LogError
+import icrtool
+from icrtool.cli.inputs import named_place
+from icrtool.errors import ConfigError, IcrToolError, LogError
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.source import SavedBytes, filesystem, find
+from icrtool.logs.containers.source import SavedBytes, _check_redirect, filesystem, find
 from icrtool.records.input_limits import MOST_BYTES, SERVER_TIMEOUT_S, most_bytes, server_timeout_s
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.samples import InputFile
+from support.scripts import load_script
 
 SECRET = "d0ntPr1ntTh1s"
 FORMS = {
@@ -48,6 +52,15 @@ FORMS = {
     "s3://bucket/mon day/a [1].mcap?sig={s}": "s3://bucket/mon day/a [1].mcap",
     "az://box/a.mcap?sv=1&sig={s}%3D": "az://box/a.mcap",
     "S3://KEY:{s}@bucket/a.mcap": "S3://bucket/a.mcap",
+    " https://user:{s}@host/a.mcap": "https://…",
+    "\ufeffhttps://user:{s}@host/a.mcap": "https://…",
+    "'s3://bucket/a.mcap?sig={s}'": "s3://…",
+    "<https://host/a.mcap?t={s}>": "https://…",
+    "URL:https://user:{s}@host/a.mcap": "https://…",
+    "https:/user:{s}@host/a.mcap": "https://…",
+    "https:///user:{s}@host/a.mcap": "https://…",
+    "https:\\\\user:{s}@host\\a.mcap": "https://…",
+    "ftp:\\\\user:{s}@host\\a.mcap": "ftp://…",
 }
 REFUSED = (
     "file:///dev/zero", "memory://x", "github://a:b@c/d", "ftp://host/a.mcap", "zip://a::s3://b/c.zip", "local://a",
@@ -65,6 +78,30 @@ def test_no_secret_of_an_address_is_in_its_text_its_name_or_an_error(form: str) 
     assert SECRET not in f"{place} {place.name} {place!r} {place.parts} {place / 'run'} {LogError(place, 'x')}"
     assert place.url == url
     assert SECRET not in place.without_own_secrets(f"GET {url} failed: {SECRET}")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_below_an_address_its_secrets_stay_hidden(form: str) -> None:
+    place = place_of(form.format(s=SECRET))
+    assert SECRET not in f"{place / 'run' / 'a.csv'} {(place / 'run').name}"
+
+
+@pytest.mark.parametrize("written", ["https://user:{s}@host/a.mcap", "https:/user:{s}@host/a.mcap"])
+def test_an_address_that_a_script_gives_as_a_path_is_refused_without_its_secrets(written: str) -> None:
+    for read in (icrtool.read_log, icrtool.open_run):
+        with pytest.raises(IcrToolError, match="https://") as error:
+            read(Path(written.format(s=SECRET)))
+        assert SECRET not in str(error.value)
+
+
+def test_the_name_of_a_group_stands_before_an_address_and_not_in_one() -> None:
+    assert named_place("wet=https://host/a=b.mcap?c=d") == ("wet", UrlPath("https://host/a=b.mcap?c=d"))
+    for address in ("https://host/a?token=b", "s3://bucket/x=1/a.mcap", "'https://host/a?token=b'"):
+        assert named_place(address)[1] == UrlPath(address)
+
+
+def test_an_address_of_any_length_leaves_space_for_the_reason() -> None:
+    assert "no such file" in str(LogError(UrlPath(f"https://host/{'x' * 20_000}"), "no such file"))
 
 
 def test_escaped_forms_of_a_secret_are_left_out_of_a_library_s_text() -> None:
@@ -92,6 +129,15 @@ def test_what_identifies_a_file_is_its_content_or_its_whole_address() -> None:
     assert stated(one, etag="a").identity != stated(one, etag="b").identity
     assert stated(one, etag="Sat, 01 Jan 2026 00:00:00 GMT").identity[1] == UrlPath(one).digest
     assert InputFile("a", 9, "ab").identity == InputFile("b", 9, "ab").identity
+
+
+@pytest.mark.parametrize("behind", ["?x::file:///etc/passwd", "?t=a::b"])
+@pytest.mark.parametrize("scheme", ["https", "s3"])
+def test_no_chain_is_followed_behind_a_question_mark(scheme: str, behind: str) -> None:
+    pytest.importorskip("aiohttp" if scheme == "https" else "s3fs", reason="needs the extra icrtool[cloud]")
+    files, name = filesystem(UrlPath(f"{scheme}://host/a.mcap{behind}"))
+    assert scheme in files.protocol
+    assert name.endswith(f"host/a.mcap{behind}")
 
 
 @contextmanager
@@ -154,6 +200,46 @@ def test_a_server_that_lies_about_a_range_is_refused_and_little_is_read(lie: str
         open_log(UrlPath(url))
     assert len(str(error.value).splitlines()) == 1
     assert sent[0] < 50_000_000  # what the sockets hold
+
+
+REDIRECTS = {
+    "10.0.0.1/a.mcap": "10.0.0.1, which has no public address",
+    "169.254.169.254/latest/meta-data": "169.254.169.254, which has no public address",
+    "[::1]:1/a.mcap": "::1, which has no public address",
+    "localhost:1/a.mcap": "localhost, which has no public address",
+}
+
+
+@pytest.mark.parametrize("target", REDIRECTS)
+def test_a_redirect_to_a_machine_that_others_do_not_reach_is_refused(target: str) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    away = f"HTTP/1.1 302 F\r\nLocation: http://{target}\r\nContent-Length: 0\r\n\r\n".encode()
+    with lying_server(away) as (url, _), pytest.raises(LogError, match=re.escape(REDIRECTS[target])) as error:
+        open_log(UrlPath(url))
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_redirect_from_https_to_http_or_a_file_is_refused_and_one_to_a_public_host_is_followed() -> None:
+    yarl = pytest.importorskip("yarl", reason="needs the extra icrtool[http]")
+    for target in ("http://host/a", "file:///etc/passwd"):
+        with pytest.raises(ValueError, match="redirects from https://"):
+            asyncio.run(_check_redirect(yarl.URL("https://host/a"), yarl.URL(target)))
+    asyncio.run(_check_redirect(yarl.URL("https://host/a"), yarl.URL("https://93.184.215.14/a")))
+    asyncio.run(_check_redirect(yarl.URL("http://host/a"), yarl.URL("https://host/b")))
+
+
+def test_a_server_that_redirects_to_another_place_of_its_own_is_read(tmp_path: Path) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    log = Path(__file__).parents[3] / "sample_logs" / "wheeled_lawnmower.mcap"
+    server = load_script("fuzz_addresses").web_server(log.read_bytes())
+    try:
+        with contextlib.closing(
+            open_log(UrlPath(f"http://127.0.0.1:{server.server_port}/away-here.mcap"))
+        ) as container:
+            assert container.channels
+    finally:
+        server.shutdown()
+        server.server_close()
 
 
 def test_a_silent_server_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -337,8 +337,9 @@ def test_thousands_of_pairs_of_topics_and_of_frames_take_no_quadratic_time(tmp_p
         (b"," * 2_000_000 + b"\n1", "columns"),
         (b"t_s,v_left_mps,v_right_mps,north_m,east_m,heading_rad\n" + b"1,2,3,4,5,6,7,8\n" * 9, "more values"),
         (b"t_s,v_left_mps,v_right_mps,north_m,east_m,heading_rad\n" + b"1," + b"9" * 400 + b",3,4,5,6\n" * 9, "number"),
+        (b"s\rp,v_left_mps,v_right_mps\n1,0.9,0.7\n2,0.9,0.7\n", "more values"),
     ],
-    ids=["columns", "values", "digits"],
+    ids=["columns", "values", "digits", "a carriage return in the first line"],
 )
 def test_a_table_that_is_none_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "log.csv"
