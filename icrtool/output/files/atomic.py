@@ -286,7 +286,7 @@ def partial_at(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
         with suppress(FileNotFoundError):
             if _is_left(left) and (left.suffix == PARTIAL_SUFFIX or place.exists()):
                 remove(left)
-    partial = place.with_name(_hidden_name(place, _writer(), PARTIAL_SUFFIX))
+    partial = place.with_name(_hidden_name(place, writer(), PARTIAL_SUFFIX))
     with unfinished(partial):
         try:
             make(partial)
@@ -300,16 +300,23 @@ def _hidden_name(place: Path, writer: str, suffix: str = "") -> str:
     return f"{HIDDEN}{blake2b(os.fsencode(place.name), digest_size=8).hexdigest()}-{writer}{suffix}"
 
 
-def _writer() -> str:
-    """Return host and process for a hidden name, with random letters."""
+def writer() -> str:
+    """Return host and process of this command, with random letters: for a hidden name, or a claim to an address."""
     return f"{crc32(platform.node().encode()):08x}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def _is_left(path: Path) -> bool:
     """Return whether no process writes a hidden file: its process has ended, or it is `ABANDONED_S` old."""
-    host, process, _ = path.name.split("-")[-3:]
-    is_here = sys.platform == "linux" and _writer().startswith(f"{host}-")
-    return (is_here and not Path("/proc", process).exists()) or path.lstat().st_mtime < time.time() - ABANDONED_S
+    return not has_process("-".join(path.name.split("-")[-3:])) or path.lstat().st_mtime < time.time() - ABANDONED_S
+
+
+def has_process(stated: str) -> bool:
+    """Return whether the process that `writer` states may still write; True where that cannot be known."""
+    host, _, rest = stated.partition("-")
+    number = rest.partition("-")[0]
+    if sys.platform != "linux" or not writer().startswith(f"{host}-") or not number.isdecimal():
+        return True
+    return Path("/proc", number).exists()
 
 
 def put(partial: Path, place: Path) -> None:
@@ -325,7 +332,7 @@ def put(partial: Path, place: Path) -> None:
     if not place.is_dir():
         partial.replace(place)
     elif not _exchange(partial, place):
-        old = place.with_name(_hidden_name(place, _writer(), OLD_SUFFIX))
+        old = place.with_name(_hidden_name(place, writer(), OLD_SUFFIX))
         place.rename(old)
         try:
             partial.rename(place)

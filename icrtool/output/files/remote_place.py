@@ -1,21 +1,25 @@
 """Results at an address: made in a temporary folder, then uploaded; the files that make results valid come last.
 
+Of several commands that upload to one address at the same time, the first one claims it; the others change nothing.
+
 Only this module writes over a connection. All others write to a folder on disk, which `on_disk` gives them.
 """
 
 from __future__ import annotations
 
-import secrets
+import errno
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from icrtool.errors import IcrToolError, LogError, OutputError
 from icrtool.logs.containers.source import asked, filesystem, version_of
 from icrtool.logs.containers.unpack import ScratchFolder
-from icrtool.output.files.atomic import make_folders, place_errors, write_file
+from icrtool.output.files.atomic import ABANDONED_S, has_process, make_folders, place_errors, write_file, writer
 from icrtool.output.files.formats import CHECKSUM_FILE, SOURCES_FILE
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import UrlPath
@@ -30,8 +34,13 @@ MOST_REQUESTS = 8
 """Largest number of requests at the same time."""
 
 _PROBE, _CLAIM = ".icrtool-upload", ".icrtool-writer"
-"""Names of two files: the first is written and removed before any work, to test the place; the second states which
-command uploads results and exists during the upload."""
+"""Names of two files. The first is written and removed before any work, to test the place. The second states which
+command uploads results, and since when; it exists during the upload, in which no other command changes the place."""
+
+CLAIM_CHECKED_S = 60.0
+"""Time after which a command looks again whether the claim is still its own [s], before it uploads a further file."""
+
+_LONGEST_CLAIM = 200
 
 Needed = Callable[[str], bool]
 """Whether the content of a file is needed, by its name below the place. Of other files only the name is needed."""
@@ -130,6 +139,7 @@ class _Store:
             self._files, self._name = filesystem(place)
         self._name = self._name.rstrip("/")
         self._found: list[object] = []
+        self._checked_s = 0.0
 
     def put(self, content: bytes, name: str = "") -> None:
         """Write a file."""
@@ -167,39 +177,95 @@ class _Store:
         if not changed and not gone:
             return
         claim = self._claim()
-        last = [name for name in COUNTS if name in now]
-        self.remove([name for name in COUNTS if name in before])
-        self.remove([name for name in gone if name not in COUNTS])
-        # The first files, run.json among them, show that the rest of an interrupted upload is icrtool's.
-        first = [name for name in changed if name.endswith(".json") and name not in last]
-        for names in (first, [name for name in changed if name not in {*first, *last}], last):
-            if names is last:
+        try:
+            if self._what_counts() != self._found:
+                advice = "its results stay; name another place, or run the command again"
+                raise OutputError(self._place, "another command wrote there meanwhile", advice)
+            last = [name for name in COUNTS if name in now]
+            self.remove([name for name in COUNTS if name in before])
+            self.remove([name for name in gone if name not in COUNTS])
+            # The first files, run.json among them, show that the rest of an interrupted upload is icrtool's.
+            first = [name for name in changed if name.endswith(".json") and name not in last]
+            for names in (first, [name for name in changed if name not in {*first, *last}], last):
                 self._check_claim(claim)
-            self._each(lambda name: self._files.put_file(str(folder / name), self._of(name)), names)
-        self.remove([_CLAIM])
+                self._each(partial(self._put_file, folder, claim), names)
+        finally:
+            # Without a connection it stays, and the next command of this host sees that its process is gone.
+            with suppress(IcrToolError):
+                self._check_claim(claim)
+                self.remove([_CLAIM])
+
+    def _put_file(self, folder: Path, claim: bytes, name: str) -> None:
+        """Copy a file of the folder to the address."""
+        if time.time() > self._checked_s + CLAIM_CHECKED_S:
+            self._check_claim(claim)
+        self._files.put_file(str(folder / name), self._of(name))
 
     def _claim(self) -> bytes:
-        """Write a claim to the place and return it; of several commands the last one that claims continues.
+        """Write a claim to the place, where there is none of a living command, and return it.
+
+        The store itself sees to it that of several commands only one can write the claim: all others end before they
+        changed anything.
 
         Raises
         ------
         OutputError
-            Another command wrote there since this one began.
+            Another command writes there.
         """
-        advice = "its results stay; name another place, or run the command again"
-        if self._what_counts() != self._found:
-            raise OutputError(self._place, "another command wrote there meanwhile", advice)
-        claim = secrets.token_hex(16).encode()
-        self.put(claim, _CLAIM)
+        claim = f"{writer()} {time.time():.0f}".encode()
+        if not self._create(claim):
+            other = self._claim_there()
+            if not _is_abandoned(other):
+                minutes = max(time.time() - _time_of(other), 0.0) / 60
+                why = f"another command has been writing there for {minutes:.0f} min"
+                advice = f"its results stay; wait for its end, or remove {_CLAIM} there where it was killed"
+                raise OutputError(self._place, why, advice)
+            self.remove([_CLAIM])
+            if not self._create(claim):
+                self._refuse()
+        # A store that writes the second claim over the first one gives it to both.
         self._check_claim(claim)
         return claim
 
+    def _create(self, claim: bytes) -> bool:
+        """Write the claim where no other is there; return whether it was written."""
+
+        def write(**how: str) -> int:
+            try:
+                self._files.pipe_file(self._of(_CLAIM), claim, **how)
+            except OSError as err:
+                if isinstance(err, FileExistsError) or err.errno in (errno.EINVAL, errno.EBUSY):
+                    return errno.EEXIST
+                if err.errno != errno.ENOSYS:
+                    raise
+                return errno.ENOSYS
+            return 0
+
+        answer = self._done(lambda: write(mode="create"))
+        # Some stores know no conditional writes.
+        return not (self._done(write) if answer == errno.ENOSYS else answer)
+
+    def _claim_there(self) -> bytes:
+        """Return the claim at the place; empty where there is none."""
+
+        def ask() -> bytes:
+            self._files.invalidate_cache()
+            try:
+                return bytes(self._files.cat_file(self._of(_CLAIM), end=_LONGEST_CLAIM))
+            except FileNotFoundError:
+                return b""
+
+        return self._done(ask)
+
     def _check_claim(self, claim: bytes) -> None:
         """Refuse to continue where another command claimed the place at the same time."""
-        self._files.invalidate_cache()
-        if self._done(lambda: self._files.cat_file(self._of(_CLAIM))) != claim:
-            why = "another command began to write there at the same time"
-            raise OutputError(self._place, why, "its results stay; run this command again")
+        if self._claim_there() != claim:
+            self._refuse()
+        self._checked_s = time.time()
+
+    def _refuse(self) -> NoReturn:
+        why = "another command began to write there at the same time"
+        raise OutputError(self._place, why, "its results stay; run this command again")
 
     def _what_counts(self) -> list[object]:
         """Return the store's facts about the files without which results are not valid."""
@@ -264,6 +330,20 @@ def _as_output(place: UrlPath) -> Iterator[None]:
     except LogError as err:
         why = "cannot be written" if err.why == "no such file" else err.why
         raise OutputError(place, why, err.advice or "is there such a bucket?") from err
+
+
+def _time_of(claim: bytes) -> float:
+    """Return when a claim was written [s of the epoch]; 0 where it does not state this."""
+    stated = claim.rpartition(b" ")[2]
+    return float(stated) if stated.isdigit() and len(stated) < 15 else 0.0
+
+
+def _is_abandoned(claim: bytes) -> bool:
+    """Return whether the command that wrote a claim is gone: its process has ended, or it wrote an hour ago."""
+    stated = claim.partition(b" ")[0].decode("ascii", "replace")
+    # A process writes to a place once at a time: its own claim is left from a broken connection.
+    is_own = stated.rpartition("-")[0] == writer().rpartition("-")[0]
+    return is_own or not has_process(stated) or _time_of(claim) < time.time() - ABANDONED_S
 
 
 def _identity(file: Path) -> tuple[int, int]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import functools
+import hashlib
 import json
 import os
 import shutil
@@ -18,6 +21,7 @@ import icrtool
 from icrtool.cli import main
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files import remote_place
+from icrtool.output.files.atomic import writer
 from icrtool.output.files.remote_place import on_disk
 from icrtool.records.places import UrlPath
 from support.batches import in_this_process
@@ -289,5 +293,90 @@ def test_of_two_commands_that_write_to_one_address_one_ends_with_an_error(store,
     if moment == "upload":
         assert "smoothed.csv" in names(store, "runs/one/")
         assert icrtool.open_run("s3://field/runs/one").document.request.smooth
+        assert ".icrtool-writer" not in names(store, "runs/one/")
     else:
-        assert "B2SUMS" not in names(store, "runs/one/")
+        # nothing was changed before the claim was looked at, and the claim of the other command stays
+        assert names(store, "runs/one/") == [".icrtool-writer"]
+
+
+@pytest.mark.parametrize("group", [0, 1, 2])
+def test_a_command_that_writes_while_another_uploads_changes_nothing_and_the_run_is_whole(
+    store, monkeypatch, capfd, group
+):
+    """The other command begins and ends before each group of files of this one."""
+    each, others, calls = remote_place._Store._each, [], []
+
+    def between(self, request, files):
+        if isinstance(request, functools.partial):
+            calls.append(0)
+            if len(calls) == group + 1:
+                others.append(fit_apart())
+        return each(self, request, files)
+
+    monkeypatch.setattr(remote_place._Store, "_each", between)
+    status, said = run(monkeypatch, capfd, *FIT)
+    assert status == 0, said
+    assert others == [1]
+    assert ".icrtool-writer" not in names(store, "runs/one/")
+    found = icrtool.open_run("s3://field/runs/one")  # the sums of its files fit
+    assert not found.document.request.smooth
+    for line in content(store, "runs/one/B2SUMS").decode().splitlines():
+        digest, _, name = line.partition("  ")
+        assert hashlib.blake2b(content(store, f"runs/one/{name}")).hexdigest() == digest
+
+
+def test_a_claim_of_a_living_command_is_named_and_one_of_a_dead_command_is_replaced(store, monkeypatch, capfd):
+    here = writer().partition("-")[0]
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    now = int(time.time())
+    claims = {
+        f"{here}-{os.getppid()}-0123abcd {now - 600}": "has been writing there for 10 min",
+        f"0123abcd-1-0123abcd {now - 60}": "has been writing there for 1 min",
+        f"{here}-{gone.pid}-0123abcd {now}": "",
+        f"0123abcd-1-0123abcd {now - 7200}": "",
+        "\x1b[2J": "",
+        "9" * 5000: "",
+    }
+    for claim, words in claims.items():
+        store.client.put_object(Bucket="field", Key="runs/one/.icrtool-writer", Body=claim.encode())
+        status, said = run(monkeypatch, capfd, *FIT, "--overwrite")
+        assert status == bool(words), said
+        if words:
+            assert f"s3://field/runs/one: another command {words}; its results stay" in said
+            assert content(store, "runs/one/.icrtool-writer") == claim.encode()
+        else:
+            assert ".icrtool-writer" not in names(store, "runs/one/")
+
+
+def test_a_store_without_conditional_writes_is_written_all_the_same(store, monkeypatch, capfd):
+    import s3fs
+
+    put = s3fs.S3FileSystem._pipe_file
+
+    async def without(self, path, data, *given, mode="overwrite", **named):
+        if mode == "create":
+            raise OSError(errno.ENOSYS, "A header you provided implies functionality that is not implemented.")
+        return await put(self, path, data, *given, **named)
+
+    monkeypatch.setattr(s3fs.S3FileSystem, "_pipe_file", without)
+    status, said = run(monkeypatch, capfd, *FIT)
+    assert status == 0, said
+    assert len(icrtool.open_run("s3://field/runs/one").states) == 19_901
+
+
+def test_a_claim_that_another_command_took_after_an_hour_is_seen_between_files(store, monkeypatch, capfd):
+    put, seen = remote_place._Store._put_file, []
+
+    def after_the_other(self, folder, claim, name):
+        if not seen:
+            self.put(b"of another command", remote_place._CLAIM)
+            self._checked_s = 0.0
+        seen.append(name)
+        return put(self, folder, claim, name)
+
+    monkeypatch.setattr(remote_place._Store, "_put_file", after_the_other)
+    status, said = run(monkeypatch, capfd, *FIT)
+    assert status == 1
+    assert "another command began to write there" in said
+    assert "states.csv" not in names(store, "runs/one/")
