@@ -272,7 +272,7 @@ def use_address(folder: Path, address: OddAddress, command: tuple[str, ...], por
     AssertionError
         A rule was broken.
     """
-    from icrtool.logs.containers import source
+    from icrtool.logs.containers import connection
     from icrtool.records.places import place_of
 
     command = (*command, *(ROBOT if command[0] in WITH_ROBOT else ()))
@@ -287,7 +287,7 @@ def use_address(folder: Path, address: OddAddress, command: tuple[str, ...], por
     outside = {path.name for path in folder.parent.iterdir()}
     with (
         connections.watched(),
-        mock.patch.object(source, "PAUSES_S", ()),
+        mock.patch.object(connection, "PAUSES_S", ()),
         mock.patch("gcsfs.retry.min", return_value=0.0, create=True),
         mock.patch("azure.storage.blob._shared.policies_async.ExponentialRetry.get_backoff_time", return_value=0.0),
         mock.patch("icrtool.fleet.batch.process_apart", in_this_process),

@@ -26,7 +26,7 @@ column of each row, and rows of two bytes below thousands of names would fill th
 _COUNTED_BYTES = 1 << 20
 
 MORE_VALUES = "its rows have more values than its first line has names"
-"""Why a table is refused whose columns cannot be told apart."""
+"""Why a table is refused: values of a row belong to no column."""
 
 
 class TableForm(NamedTuple):

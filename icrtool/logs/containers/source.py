@@ -1,61 +1,40 @@
 """Files that are read at any place: on disk, or in object stores and on web servers, by ranges or fetched whole.
 
-The one place that opens connections, by fsspec, and only for an address that the user, or his manifest, names.
-Credentials are found by the provider's own library.
+`connection.py` opens the connections, and only for an address that the user, or his manifest, names.
 """
 
 from __future__ import annotations
 
 import hashlib
-import logging
 import re
 import shutil
-import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from threading import Lock, local
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.logs.containers.connection import (
+    LARGEST_LISTING_BYTES,
+    SLOWEST_BPS,
+    asked,
+    check_pace,
+    filesystem,
+    in_time,
+)
 from icrtool.logs.containers.container import ahead
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, natural_order, unpacked_name
 from icrtool.records.input_limits import most_bytes, server_timeout_s
-from icrtool.records.places import LARGEST_DOCUMENT_BYTES, SCHEMES, UrlPath, place_of, without_secrets
+from icrtool.records.places import LARGEST_DOCUMENT_BYTES, UrlPath, place_of, without_secrets
 from icrtool.records.samples import InputFile
-from icrtool.records.text import LONGEST_NAME, LONGEST_STORED, shortened
-
-Result = TypeVar("Result")
-
-SLOWEST_BPS = 10_000
-"""Slowest rate at which a server may send what it was asked for, after `server_timeout_s` [bytes/s]. A server that
-sends a byte now and then would else keep a command for days."""
-
-LARGEST_LISTING_BYTES = 1 << 22
-"""Largest page that a web server may send as the list of a folder [bytes]: some 40,000 names."""
-
-_NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
-          "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
-"""The library that each kind of address is read with."""
-
-_LOGGERS = ("fsspec", "s3fs", "aiobotocore", "botocore", "gcsfs", "google", "adlfs", "azure", "aiohttp", "asyncio")
-
-PAUSES_S = (0.5, 2.0)
-"""Pauses before a request to a web server is repeated [s]; the libraries of object stores repeat requests
-themselves."""
-
-_FAILURES = (
-    ("botocore.exceptions", "BotoCoreError"), ("botocore.exceptions", "ClientError"), ("aiohttp", "ClientError"),
-    ("google.auth.exceptions", "GoogleAuthError"), ("gcsfs.retry", "HttpError"),
-    ("azure.core.exceptions", "AzureError"), ("fsspec.exceptions", "FSTimeoutError"),
-)  # fmt: skip
-"""Errors that libraries raise in addition to OSError, where they are loaded."""
+from icrtool.records.text import LONGEST_NAME
 
 NEAR_BYTES = 1 << 15
 """Longest gap between two ranges of a distant file that is read with them [bytes]: a request takes the time of some 100
@@ -66,172 +45,8 @@ _LEAST_BYTES = 1 << 18
 
 _FETCHED_BYTES, PIECES_AHEAD = 1 << 24, 4
 
-_START_BYTES, _READ_BYTES = 512, 1 << 16
-"""Bytes that show what a file is; bytes of a page that are read at a time."""
-
-
-def filesystem(path: UrlPath) -> tuple[Any, str]:
-    """Return the fsspec file system of an address, and the name of the file in it."""
-    if problem := path.problem():
-        advice = f"an address begins with {', '.join(f'{scheme}://' for scheme in SCHEMES)}; name a file by its path"
-        raise LogError(path, f"is not read: {problem}", advice)
-    needed = _NEEDS[path.scheme]
-    extra = "http" if needed == "aiohttp" else "cloud"
-    try:
-        import fsspec
-
-        kind: Any = fsspec.get_filesystem_class(path.scheme)
-    except ImportError as err:
-        raise LogError(path, f"needs {needed or err}", f"pip install 'icrtool[{extra}]'") from err
-    for name in _LOGGERS:
-        # They log tracebacks of requests, and addresses with their queries; one line reports where they fail.
-        if (logger := logging.getLogger(name)).level == logging.NOTSET:
-            logger.setLevel(logging.CRITICAL + 1)
-    try:
-        # `url_to_fs` of fsspec would follow chains with ::, also behind a question mark
-        address = path.scheme + path.url[len(path.scheme) :]
-        settings = asked(path, lambda: {**kind._get_kwargs_from_urls(address), **_patience(path.scheme)})  # noqa: SLF001 - as it does
-        found: tuple[Any, str] = asked(path, lambda: (kind(**settings), kind._strip_protocol(address)))  # noqa: SLF001
-    except (KeyError, IndexError, TypeError, AttributeError, NotImplementedError) as err:
-        raise LogError(path, "is no address that can be read", type(err).__name__) from None
-    return found
-
-
-def _patience(scheme: str) -> dict[str, Any]:
-    """Return the settings of a file system with which requests to a silent server end."""
-    quiet_s = server_timeout_s()
-    if scheme.startswith("http"):
-        from aiohttp import ClientTimeout
-
-        timeout = ClientTimeout(total=None, sock_connect=quiet_s, sock_read=quiet_s)
-        return {
-            "client_kwargs": {"timeout": timeout, "response_class": _short_pages(), "trace_configs": [_redirects()]}
-        }
-    if scheme.startswith("s3"):
-        return {"config_kwargs": {"connect_timeout": quiet_s, "read_timeout": quiet_s, "retries": {"max_attempts": 1}}}
-    return {}
-
-
-@cache
-def _short_pages() -> type[Any]:
-    """Return the class of answers of web servers whose whole body is not read beyond `LARGEST_LISTING_BYTES`."""
-    from aiohttp import ClientResponse
-
-    class ShortPage(ClientResponse):
-        async def read(self) -> bytes:
-            if self._body is None:
-                body, began_s = bytearray(), time.monotonic()
-                while piece := await self.content.read(_READ_BYTES):
-                    body += piece
-                    _check_pace(began_s, len(body))
-                    if len(body) > LARGEST_LISTING_BYTES:
-                        raise ValueError(f"its server sends a list of more than {LARGEST_LISTING_BYTES:,} bytes")
-                self._body = bytes(body)
-            return self._body
-
-    return ShortPage
-
-
-@cache
-def _redirects() -> Any:  # noqa: ANN401 - of a library
-    """Return what looks at the redirects of web servers, and refuses those that `_check_redirect` refuses."""
-    from aiohttp import TraceConfig
-    from yarl import URL
-
-    async def look(_: object, __: object, redirect: Any) -> None:  # noqa: ANN401 - of a library
-        headers = redirect.response.headers
-        target = redirect.url.join(URL(headers.get("Location") or headers.get("URI") or ""))
-        await _check_redirect(redirect.url, target)
-
-    looking = TraceConfig()
-    looking.on_request_redirect.append(look)
-    return looking
-
-
-async def _check_redirect(url: Any, target: Any) -> None:  # noqa: ANN401 - addresses of a library
-    """Refuse a redirect from https to another scheme, or to another host that has no public address.
-
-    A server could else have a command read from a machine that only this one reaches.
-    """
-    import asyncio
-    from ipaddress import ip_address
-
-    if target.scheme not in {url.scheme, "https"}:
-        raise ValueError(f"its server redirects from {url.scheme}:// to {target.scheme[:LONGEST_NAME]}://")
-    if target.host == url.host:
-        return
-    found = await asyncio.get_running_loop().getaddrinfo(target.host, target.port)
-    if not all(ip_address(str(one[4][0]).partition("%")[0]).is_global for one in found):
-        raise ValueError(f"its server redirects to {target.host}, which has no public address")
-
-
-def _in_time(files: Any, method: str, *given: object, expected_bytes: int = 0, **named: object) -> Any:  # noqa: ANN401 - of a library
-    """Return what a method of a file system returns; `TimeoutError` where its server sends too slowly.
-
-    Parameters
-    ----------
-    expected_bytes : that the answer has
-    """
-    if not getattr(files, "async_impl", False):
-        return getattr(files, method)(*given, **named)
-    from fsspec.asyn import sync
-
-    seconds = server_timeout_s() + expected_bytes / SLOWEST_BPS
-    return sync(files.loop, getattr(files, f"_{method}"), *given, timeout=seconds, **named)
-
-
-def _check_pace(began_s: float, received: int) -> None:
-    """Refuse a server that sent fewer bytes than `SLOWEST_BPS` asks for, since a time of `time.monotonic`."""
-    if time.monotonic() - began_s > server_timeout_s() + received / SLOWEST_BPS:
-        raise TimeoutError
-
-
-def asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done: str = "read") -> Result:
-    """Return the answer to a request, made again where the connection broke.
-
-    Parameters
-    ----------
-    done : what is to be done: ``read`` or ``written``
-
-    Raises
-    ------
-    LogError
-        The file is not there, it must not be done, or the connection stays broken.
-    """
-    pauses = list(PAUSES_S) if again and path.scheme.startswith("http") else []
-    while True:
-        try:
-            return ask()
-        except _failures() as err:
-            # fsspec calls every failure of a web server a file that is not there, and names the true one as its cause.
-            cause = err.__cause__ if isinstance(err, FileNotFoundError) and err.__cause__ is not None else err
-            status = getattr(cause, "status", None)
-            if isinstance(cause, FileNotFoundError) or status == 404:
-                raise LogError(path, "no such file") from None
-            refused = isinstance(cause, PermissionError | ValueError) or status in {401, 403}
-            timed_out = isinstance(cause, TimeoutError)
-            if refused or timed_out or not pauses:
-                why = f"may not be {done}" if refused else f"cannot be {done}"
-                raise LogError(path, why, _words_of(cause, path)) from None
-            time.sleep(pauses.pop(0))
-
-
-def _words_of(cause: BaseException, path: UrlPath) -> str:
-    """Return what an error of a library states, without the secrets of the address."""
-    if isinstance(cause, TimeoutError):
-        quiet, rate = f"{server_timeout_s():g} s", f"{SLOWEST_BPS / 1e3:g} kB/s"
-        return f"its server sent nothing for {quiet}, or less than {rate} after them; --server-timeout sets the time"
-    status = getattr(cause, "status", None)
-    if isinstance(status, int):
-        # the rest of such a text is the address, or another address to which the server redirected
-        return f"its server answered {status} {getattr(cause, 'message', '')}".strip()
-    return shortened(path.without_own_secrets(str(cause)), LONGEST_STORED) or type(cause).__name__
-
-
-def _failures() -> tuple[type[Exception], ...]:
-    """Return the errors of a broken connection or a refused request."""
-    loaded = [getattr(sys.modules.get(module), name, None) for module, name in _FAILURES]
-    return (OSError, ValueError, *(one for one in loaded if one is not None))
+_START_BYTES = 512
+"""Number of bytes that show what a file is."""
 
 
 class _NoRangeError(ValueError):
@@ -351,7 +166,7 @@ class RemoteFile:
                 while left and (piece := await answer.content.read(left)):
                     pieces.append(piece)
                     left -= len(piece)
-                    _check_pace(began_s, end - begin - left)
+                    check_pace(began_s, end - begin - left)
                 return b"".join(pieces)
 
         async def all_of_them() -> list[bytes]:
@@ -401,7 +216,7 @@ class RemoteFile:
                 return self._web_ranges(begins, ends)
             expected = sum(ends) - sum(begins)
             names = [self._name] * len(begins)
-            pieces = _in_time(self._files, "cat_ranges", names, begins, ends, expected_bytes=expected)
+            pieces = in_time(self._files, "cat_ranges", names, begins, ends, expected_bytes=expected)
             if (broken := next((one for one in pieces if isinstance(one, BaseException)), None)) is not None:
                 raise broken
             return list(map(bytes, pieces))
@@ -454,7 +269,7 @@ class RemoteFile:
             with asked(self.path, lambda: self._files.open(self._name, block_size=0, **options)) as stream:
                 while piece := asked(self.path, lambda: stream.read(_FETCHED_BYTES), again=False):
                     received += len(piece)
-                    asked(self.path, partial(_check_pace, began_s, received), again=False)
+                    asked(self.path, partial(check_pace, began_s, received), again=False)
                     yield piece
             return
         places = range(0, self.size, _FETCHED_BYTES)
@@ -513,7 +328,7 @@ def _about(path: UrlPath) -> dict[str, Any]:
     """Return what a store states about a file now, whatever it stated before."""
     files, name = filesystem(path)
     files.invalidate_cache(name)
-    about: dict[str, Any] = asked(path, lambda: _in_time(files, "info", name))
+    about: dict[str, Any] = asked(path, lambda: in_time(files, "info", name))
     return about
 
 
@@ -572,7 +387,7 @@ def find(path: UrlPath) -> list[UrlPath]:
     files, name = filesystem(path)
     # folders in folders without an end are no reason to go on for ever
     most = LARGEST_LISTING_BYTES if path.scheme.startswith("http") else LARGEST_DOCUMENT_BYTES
-    matched: dict[str, Any] = asked(path, lambda: _in_time(files, "glob", name, detail=True, expected_bytes=most))
+    matched: dict[str, Any] = asked(path, lambda: in_time(files, "glob", name, detail=True, expected_bytes=most))
     found = []
     for inner, about in matched.items():
         one = _address(files, inner, path)
@@ -585,7 +400,7 @@ def find(path: UrlPath) -> list[UrlPath]:
 def _is_there(path: UrlPath) -> bool:
     """Return whether there is a file of this very name, which may have brackets."""
     files, name = filesystem(path)
-    return bool(asked(path, lambda: _in_time(files, "exists", name)))
+    return bool(asked(path, lambda: in_time(files, "exists", name)))
 
 
 def _below(folder: UrlPath) -> list[UrlPath]:

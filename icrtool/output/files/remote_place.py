@@ -17,7 +17,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, TypeVar
 
 from icrtool.errors import IcrToolError, LogError, OutputError
-from icrtool.logs.containers.source import asked, filesystem, version_of
+from icrtool.logs.containers.connection import asked, filesystem
+from icrtool.logs.containers.source import version_of
 from icrtool.logs.containers.unpack import ScratchFolder
 from icrtool.output.files.atomic import ABANDONED_S, has_process, make_folders, place_errors, write_file, writer
 from icrtool.output.files.formats import CHECKSUM_FILE, SOURCES_FILE

@@ -20,8 +20,9 @@ import pytest
 import icrtool
 from icrtool.cli.inputs import named_place
 from icrtool.errors import ConfigError, IcrToolError, LogError
+from icrtool.logs.containers.connection import check_redirect, filesystem
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.source import SavedBytes, _check_redirect, filesystem, find
+from icrtool.logs.containers.source import SavedBytes, find
 from icrtool.records.input_limits import MOST_BYTES, SERVER_TIMEOUT_S, most_bytes, server_timeout_s
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.samples import InputFile
@@ -223,9 +224,9 @@ def test_a_redirect_from_https_to_http_or_a_file_is_refused_and_one_to_a_public_
     yarl = pytest.importorskip("yarl", reason="needs the extra icrtool[http]")
     for target in ("http://host/a", "file:///etc/passwd"):
         with pytest.raises(ValueError, match="redirects from https://"):
-            asyncio.run(_check_redirect(yarl.URL("https://host/a"), yarl.URL(target)))
-    asyncio.run(_check_redirect(yarl.URL("https://host/a"), yarl.URL("https://93.184.215.14/a")))
-    asyncio.run(_check_redirect(yarl.URL("http://host/a"), yarl.URL("https://host/b")))
+            asyncio.run(check_redirect(yarl.URL("https://host/a"), yarl.URL(target)))
+    asyncio.run(check_redirect(yarl.URL("https://host/a"), yarl.URL("https://93.184.215.14/a")))
+    asyncio.run(check_redirect(yarl.URL("http://host/a"), yarl.URL("https://host/b")))
 
 
 def test_a_server_that_redirects_to_another_place_of_its_own_is_read(tmp_path: Path) -> None:

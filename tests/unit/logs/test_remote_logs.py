@@ -26,7 +26,7 @@ from icrtool.config import load_config
 from icrtool.errors import LogError
 from icrtool.fleet.fleet_files import _content
 from icrtool.fleet.recordings import find_recordings, read_manifest
-from icrtool.logs.containers import source
+from icrtool.logs.containers import connection, source
 from icrtool.logs.containers.container import MessageBlock
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.recording_files import log_name
@@ -269,14 +269,14 @@ def test_about_a_file_that_is_fetched_the_server_is_asked_once(tmp_path, monkeyp
 
 
 def test_a_broken_connection_is_made_again(monkeypatch):
-    monkeypatch.setattr(source, "PAUSES_S", (0.01, 0.01))
+    monkeypatch.setattr(connection, "PAUSES_S", (0.01, 0.01))
     with file_server(SAMPLES, broken=2) as server:
         assert messages(UrlPath(f"{server.url}/{MCAP.name}")) == messages(MCAP)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_connections_that_break_while_chunks_are_read_are_made_again_or_one_error(monkeypatch, tmp_path, layout):
-    monkeypatch.setattr(source, "PAUSES_S", (0.01, 0.01))
+    monkeypatch.setattr(connection, "PAUSES_S", (0.01, 0.01))
     drive(tmp_path / "a.mcap", size=8_000_000, **LAYOUTS[layout])
     with file_server(tmp_path) as server:
         container = open_log(UrlPath(f"{server.url}/a.mcap"))
@@ -291,7 +291,7 @@ def test_connections_that_break_while_chunks_are_read_are_made_again_or_one_erro
 
 
 def test_a_connection_that_stays_broken_is_one_line_without_secrets(monkeypatch):
-    monkeypatch.setattr(source, "PAUSES_S", (0.01, 0.01))
+    monkeypatch.setattr(connection, "PAUSES_S", (0.01, 0.01))
     with file_server(SAMPLES, token=TOKEN) as server:
         container = open_log(UrlPath(f"{server.url}/{MCAP.name}?{TOKEN}"))
         server.broken = 10_000
