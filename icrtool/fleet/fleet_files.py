@@ -196,7 +196,11 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
             name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, {})[row.log] = error
     make_folders(folder / PLOTS, folder)
-    numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model, {row.log: row.start_utc for row in rows})
+    ends = [(row.log, *(row.errors.get(error_name.replace("_p95_", f"_p95_{end}_")) for end in ("low", "high")))
+            for row in rows]  # fmt: skip
+    intervals = {log: (low, high) for log, low, high in ends if low is not None and high is not None}
+    dates = {row.log: row.start_utc for row in rows}
+    numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model, dates, intervals)
     old = set(pictures_of_batch(folder))
     for name, figure in figures_of("fleet", numbers):
         for file in (folder / PLOTS / f"{name}.{form}" for form in picture_formats):
@@ -377,6 +381,7 @@ def _pooled(
         icrs_m=tuple(result.calibration.geometry[name] for name in ICR_COLUMNS),
         within_m=None if reached is None else float(reached.distance_m),
         within_beyond=reached is not None and reached.beyond,
+        within_between_m=None if reached is None else reached.between_m,
     )  # fmt: skip
 
 

@@ -19,7 +19,8 @@ from icrtool.fleet.recordings import as_text
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, log_name
 from icrtool.output.files.remote_place import write_below
 from icrtool.pipeline import Stage, fit_into, report_into
-from icrtool.records.fleet_document import FleetFile, FleetLog, fleet_verdict
+from icrtool.records.acceptance import CHOICE_HORIZON_M
+from icrtool.records.fleet_document import FleetFile, FleetLog, fleet_verdict, next_low_name
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import plain
 from icrtool.records.requests import CalibrationInput, LogRequest
@@ -137,7 +138,9 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
         | {f"std_{name}": std for name, (_, std) in icrs.items()},
         multiplier=None if controller is None else controller.multiplier,
         multiplier_std=None if controller is None else controller.multiplier_std,
-        errors=_errors(report.document.models) | {name: plain(one.distance_m) for name, one in within},
+        errors=_errors(report.document.models)
+        | {name: plain(one.distance_m) for name, one in within}
+        | {next_low_name(one.model, one.budget_m): one.to_plan_with_m for _, one in within},
         bounds=tuple(name for name, one in within if one.beyond),
         events=len(summary.events),
         outages=len(report.outages),
@@ -172,11 +175,14 @@ def _calibration_of(given: CalibrationInput) -> Calibration:
 
 
 def _errors(models: Iterable[ModelDocument]) -> dict[str, float | None]:
-    """Return p95 and expected errors of the models of a report, by the names of columns."""
+    """Return p95 and expected errors of the models of a report, by the names of columns, and intervals of p95."""
     return {
         f"{one.name}_{metric}_{row.horizon_m:g}m_m": number
         for one in models
         for row in one.by_horizon
         if row.horizon_m in FLEET_HORIZONS_M
-        for metric, number in (("p95", row.p95_m), ("expected", row.expected_error_m))
-    }
+        for metric, number in (
+            ("p95", row.p95_m), ("expected", row.expected_error_m),
+            *((("p95_low", row.p95_low_m), ("p95_high", row.p95_high_m)) if row.horizon_m == CHOICE_HORIZON_M else ()),
+        )
+    }  # fmt: skip

@@ -137,7 +137,7 @@ FIGURES = {
     ),
     "transfer": Entry(
         "comparison", "Differences between the groups",
-        "Left: the errors of each group, by calibration. Right: an interval (95 %) that holds zero may be chance.",
+        "Above: the errors of each group, by calibration. Below: an interval (95 %) that holds zero may be chance.",
         "calibrations.transfer",
     ),
 }  # fmt: skip

@@ -95,6 +95,13 @@ class BudgetDistance(Record, frozen=True):
         )
 
     @property
+    def to_plan_with_m(self) -> float | None:
+        """The distance that the next drive keeps in 9 of 10 cases [m]; None where nothing is expected of it."""
+        if self.next_low_m is None:
+            return self.distance_m if self.beyond else None
+        return self.next_low_m
+
+    @property
     def next_text(self) -> str:
         """``5.1-18 m``, ``5.1 m or more``, or empty where nothing is expected of the next drive."""
         if self.next_low_m is None:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from msgspec import UNSET, UnsetType, field
 
-from icrtool.records.acceptance import Verdict
+from icrtool.records.acceptance import BudgetDistance, Verdict
 from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.rows import FALLBACK_ROW, MAIN_ROW
@@ -29,6 +29,12 @@ BUDGET_M = 0.5
 SHOWN_ERROR, SHOWN_FALLBACK = f"{MAIN_ROW}_p95_10m_m", f"{FALLBACK_ROW}_p95_10m_m"
 """The error of each log that is printed, drawn and compared with the baseline; the second where no held-out error
 exists."""
+
+
+def next_low_name(model: str, budget_m: float) -> str:
+    """Return the name in `FleetLog.errors` of the distance that the next drive keeps within a budget, 9 of 10."""
+    return f"{model}_next_low_{budget_m:g}m_m"
+
 
 Status = Literal["done", "failed"]
 ThisTime = Literal["processed", "skipped"]
@@ -94,7 +100,9 @@ class FleetLog(Record, frozen=True):
     repeatable : whether the same input, configuration and version give this result again
     icr : final ICRs [m] and, as ``std_…``, their standard deviations
     multiplier : (y_r - y_l)/b, wheel separation multiplier of a differential-drive controller, with `multiplier_std`
-    errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``
+    errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``; the 95 % interval
+        ``<model>_p95_low_10m_m`` to ``<model>_p95_high_10m_m``; ``<model>_next_low_<budget>m_m``, the distance within
+        the budget that the next drive keeps in 9 of 10 cases
     bounds : the names in `errors` whose distance is a lower bound
     outages, warnings : number of each
     notes : findings of the run, the grave ones among them
@@ -161,7 +169,7 @@ class FleetCalibration(Record, frozen=True):
     recommended, multiplier, multiplier_std : recommended model and multiplier of the calibration
     icrs_m : right, left, x of the calibration
     within_m : distance over which 95 % of the held-out errors stay within `BUDGET_M`; within_beyond : it is a lower
-        bound
+        bound; within_between_m : the two horizons between which it was interpolated, None in older files
     table : leave-one-log-out table as text
     key : hash of the logs and their content
     """
@@ -178,15 +186,22 @@ class FleetCalibration(Record, frozen=True):
     icrs_m: tuple[float, ...] = ()
     within_m: float | None = None
     within_beyond: bool = False
+    within_between_m: tuple[float, float] | None = None
     table: str = ""
     key: str = ""
 
     @property
-    def within_text(self) -> str:
-        """How far, as ``, within 0.5 m for 14.6 m``; empty where that is not known."""
+    def within(self) -> BudgetDistance | None:
+        """How far the held-out errors stay within `BUDGET_M`; None where that is not known."""
         if self.within_m is None:
-            return ""
-        return f", within {BUDGET_M:g} m (95 %) for {'more than ' if self.within_beyond else ''}{self.within_m:.1f} m"
+            return None
+        between_m = self.within_between_m or (self.within_m, self.within_m)
+        return BudgetDistance(MAIN_ROW, BUDGET_M, self.within_m, self.within_beyond, between_m)
+
+    @property
+    def within_text(self) -> str:
+        """How far, as ``, within 0.5 m (95 %) for about 15 m``; empty where that is not known."""
+        return "" if self.within is None else f", within {BUDGET_M:g} m (95 %) for {self.within.short_text}"
 
 
 class FleetCounts(Record, frozen=True):

@@ -12,8 +12,10 @@ from matplotlib.patches import Circle
 
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.output.figures import style
+from icrtool.output.figures.labels import Label, write_labels
 from icrtool.output.figures.sheet import Sheet, new_sheet, styled
 from icrtool.output.figures.trajectory import name_directions
+from icrtool.output.series import round_steps
 from icrtool.output.text_format import error_text, signed
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import ErrorsAt, GroupComparison
@@ -28,10 +30,14 @@ if TYPE_CHECKING:
     from icrtool.records.fleet_document import FleetLog
     from icrtool.records.run_document import RunDocument
 
-CIRCLES = 20
+CIRCLES = 5.0
+"""Approximate number of circles of errors along the path of a forecast."""
 
 FORECAST_KEY_COLUMNS = 4
 """Number of columns in the legend of a forecast."""
+
+BEYOND_LOOK: style.Look = {"color": style.OUTAGE_COLOR, "linewidth": 0, "zorder": 0.5}
+"""Area of distances at which no error was measured."""
 
 
 @styled
@@ -39,41 +45,40 @@ def forecast_figure(
     forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, gyro: Forecast | None = None, *,
     document: RunDocument | None = None, ax: Axes | None = None,
 ) -> Figure | Axes:  # fmt: skip
-    """Return the figure of a forecast, with a line for each budget and a line where measured errors end.
+    """Return the figure of a forecast: errors over distance with the budgets, and the path with circles of errors.
 
     `document`: of the run whose path it is; a run without datum has axes x and y. None: of a path with east and north.
     """
     reached = within_budget(forecast.distance_m, forecast.p95_m, budgets_m[0]) if budgets_m else None
-    answer = f"{error_text(forecast.p95_m[-1])} off (95 %) at the end of {forecast.distance_m[-1]:.0f} m"
+    total_m = float(forecast.distance_m[-1])
+    answer = f"{error_text(forecast.p95_m[-1])} off (95 %) at the end of {total_m:.0f} m"
     if reached is not None:
         answer = f"Within {budgets_m[0]:g} m (95 %) for {reached[0]:.1f} m, {answer}"
     by = "wheels alone" if gyro is None else "wheels alone, and with gyro"
-    subtitle = f"{title}: forecast error without GNSS from the start: {by}, by the calibration"
-    # Of both errors of each forecast, budgets, and up to three more.
-    entries = 2 * (1 if gyro is None else 2) + len(budgets_m) + 3
+    # Of both errors of each forecast, budgets, and up to four more.
+    entries = 2 * (1 if gyro is None else 2) + len(budgets_m) + 4
     keys_in = style.KEY_ROW_IN * max(-(-entries // FORECAST_KEY_COLUMNS) - 2, 0)
-    height_in, margins_in = 4.3 + keys_in, (0.8, 0.25, 0.75, 1.05 + keys_in)
+    height_in, margins_in = 4.5 + keys_in, (0.8, 0.25, 0.75, 1.05 + keys_in)
     layout = {"width_in": 8.2, "height_in": height_in, "wspace": 0.28}
-    sheet = new_sheet(answer, subtitle, ax, margins_in=margins_in, **layout)
+    sheet = new_sheet(
+        answer, f"{title}: forecast from the start without GNSS, {by}", ax, margins_in=margins_in, **layout
+    )
     grown, path = sheet.subplots(1, 2)[0]
     for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
         if one is not None:
-            grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **style.ICR | dash)
+            grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **style.ICR | {"linestyle": "-"} | dash)
             grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **style.FILTER | dash)
     for budget in budgets_m:
         grown.axhline(budget, label=f"budget {budget:g} m", **style.BUDGET)
-    if forecast.distance_m[-1] > measured_m:
-        grown.axvline(measured_m, label="measured up to here", **style.MEAN)
-    grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, None), ylim=(0.0, None))
+    if total_m > measured_m:
+        grown.axvspan(measured_m, total_m, label=f"beyond {measured_m:g} m: not measured", **BEYOND_LOOK)
+    grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, total_m), ylim=(0.0, None))
+    if reached is not None and not reached[1]:
+        grown.plot([reached[0]], [budgets_m[0]], zorder=5, **style.spot("black", 4.5))
+        look: style.Look = {"ha": "right", "va": "bottom", "fontsize": 8.5}
+        style.write_near(grown, f"{reached[0]:.1f} m", (reached[0], budgets_m[0]), (-3.0, 4.0), **look)
     path.plot(forecast.east_m, forecast.north_m, label="path", **style.HALF_WIDTH | {"linestyle": "-"})
-    # Circles of extrapolated errors would hide the path.
-    measured = np.flatnonzero(forecast.distance_m <= measured_m)
-    rows = measured[:: max(len(measured) // CIRCLES, 1)]
-    for east, north, radius in zip(forecast.east_m[rows], forecast.north_m[rows], forecast.p95_m[rows], strict=True):
-        path.add_patch(
-            Circle((float(east), float(north)), float(radius), fill=False, edgecolor=style.ICR["color"], linewidth=0.8)
-        )
-    path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=style.ICR["color"], linewidth=0.8)
+    _draw_error_circles(path, forecast, min(measured_m, total_m))
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
     name_directions(path, document)
@@ -81,43 +86,87 @@ def forecast_figure(
     return sheet.finished()
 
 
-SHOWN_PERCENT = 97.0
-"""Percentile of the residuals at which the axes end. Without it a few outliers would shrink the other points to a
-dot."""
+def _draw_error_circles(axes: Axes, forecast: Forecast, last_m: float) -> None:
+    """Draw the circle that holds 95 % of the errors at round distances up to `last_m`, and write the distances."""
+    step_m = max(float(min(round_steps(last_m / CIRCLES), key=lambda one: abs(one - last_m / CIRCLES))), 1.0)
+    rows = np.flatnonzero(forecast.distance_m <= last_m)
+    rows = rows[np.isclose(np.round(forecast.distance_m[rows] / step_m) * step_m, forecast.distance_m[rows])]
+    blue = style.ICR["color"]
+    at = [(float(forecast.east_m[row]), float(forecast.north_m[row])) for row in rows]
+    # the largest circle lies lowest
+    for place, row in sorted(zip(at, rows, strict=True), key=lambda one: -forecast.p95_m[one[1]]):
+        radius = float(forecast.p95_m[row])
+        axes.add_patch(Circle(place, radius, facecolor=blue, alpha=0.13, linewidth=0, zorder=1.5))
+        axes.add_patch(Circle(place, radius, fill=False, edgecolor=blue, linewidth=1.0, zorder=2.5))
+    axes.plot([], [], label="95 % of the errors by wheels", color=blue, linewidth=1.0)
+    begin: style.Look = style.spot("white") | {"label": "start", "zorder": 4}
+    axes.plot([forecast.east_m[0]], [forecast.north_m[0]], **begin)
+    if at:
+        axes.plot(*zip(*at, strict=True), zorder=4, **style.spot("black", 3.0))
+    axes.autoscale_view()
+    axes.set_aspect("equal", adjustable="datalim")
+    labels = [
+        Label(f"{forecast.distance_m[row]:g} m: {error_text(float(forecast.p95_m[row]))}", *place)
+        for place, row in zip(at, rows, strict=True)
+    ]
+    write_labels(axes, labels, [(forecast.east_m, forecast.north_m)], crossing=True, marks=at)
 
-BEFORE_LOOK: style.Look = style.spot("0.62", 3.2, "s", "0.62") | {
-    "markeredgewidth": 0.0,
-    "label": "before: as configured, ICR separation estimated",
-}
-AFTER_LOOK: style.Look = style.spot(style.ICR["color"], 2.8, "o", style.ICR["color"]) | {
-    "markeredgewidth": 0.0,
-    "label": "after: calibrated",
-}
+
+SHARES_PCT = (50.0, 95.0)
+"""Shares of the windows whose residuals are written [%]."""
+
+REST_SHOWN = 1.3
+"""Ratio of the end of the axis of residuals to their 95 % mark."""
+
+LEAST_TURNS = 5
+"""Smallest number of windows in a group of heading changes whose median is drawn."""
+TURN_GROUPS = 8
+"""Number of groups of heading changes, of equal numbers of windows."""
+
+BEFORE_LOOK: style.Look = {"color": "0.45", "linestyle": (0, (6, 2)), "linewidth": 1.5,
+                           "label": "before: as configured, ICR separation estimated"}  # fmt: skip
+AFTER_LOOK: style.Look = {"color": style.ICR["color"], "linestyle": "-", "linewidth": 1.8, "label": "after: calibrated"}
+"""Looks of the residuals before and after a calibration: luminance and dash distinguish them on a grey print."""
 
 
 @styled
 def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return residuals of displacements and of heading changes over windows, before and after."""
-    places, turns = (residuals.before, residuals.after), (residuals.turn_before, residuals.turn_after)
-    off_m = [np.hypot(*part) for part in places]
-    off_deg = [np.degrees(np.abs(part)) for part in turns]
+    """Return how many windows have a residual below each size, of places [m] and headings [deg], before and after.
+
+    The third panel has the median residual of the heading change by the heading change: a slope is a wrong multiplier.
+    """
+    off_m = [np.hypot(*part) for part in (residuals.before, residuals.after)]
+    turns = [np.degrees(part) for part in (residuals.turn_before, residuals.turn_after)]
     first, last = map(np.median, off_m)
     answer = f"Windows of the drive are off by {last:.3f} m calibrated, {first:.3f} m before"
-    windows = f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals"
-    margins_in = (0.75, 0.2, 0.7, 1.0)
-    sheet = new_sheet(answer, f"{name}: {windows}", ax, height_in=4.2, margins_in=margins_in, wspace=0.32)
-    place, turn = sheet.subplots(1, 2)[0]
-    for part, turned, look in zip(places, turns, (BEFORE_LOOK, AFTER_LOOK), strict=True):
-        place.plot(part[1], part[0], **look)
-        turn.plot(np.degrees(residuals.turn_rad), np.degrees(turned), **look)
-    for axes, sizes, unit in ((place, off_m, "m"), (turn, off_deg, "°")):
-        first, last = map(np.median, sizes)
-        axes.set_title(f"median {first:.3f} {unit} before, {last:.3f} {unit} after", loc="left", pad=5.0)
-        reach = 1.2 * max(float(np.percentile(np.concatenate(sizes), SHOWN_PERCENT)), 1e-3)
-        axes.set_ylim(-reach, reach)
-    place.set(xlim=place.get_ylim(), xlabel="Residual to the right [m]", ylabel="Residual ahead [m]")
-    turn.set(xlabel="Heading change measured, clockwise [°]", ylabel="Residual of the heading change [°]")
-    sheet.legend(markerscale=2.0)
+    windows = f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading"
+    layout: style.Look = {"width_in": 8.2, "height_in": 4.0, "margins_in": (0.75, 0.2, 1.0, 0.95), "wspace": 0.4}
+    sheet = new_sheet(answer, f"{name}: {windows}", ax, **layout)
+    place, heading, turn = sheet.subplots(1, 3)[0]
+    looks = BEFORE_LOOK, AFTER_LOOK
+    for axes, sizes, unit, of in (
+        (place, off_m, " m", "the place"), (heading, [np.abs(part) for part in turns], "°", "the heading change"),
+    ):  # fmt: skip
+        for size, look in zip(sizes, looks, strict=True):
+            ordered = np.sort(size)
+            axes.plot(ordered, 100.0 * np.arange(1, len(ordered) + 1) / max(len(ordered), 1), **look)
+        marks = [np.percentile(size, SHARES_PCT) for size in sizes]
+        texts = (f"{share:.0f} %: {before:.2f} → {after:.2f}{unit}"
+                 for share, before, after in zip(SHARES_PCT, *marks, strict=True))  # fmt: skip
+        axes.set_title("\n".join(texts), loc="left", pad=5.0, fontsize=8.5)
+        end = max(REST_SHOWN * max(float(mark[-1]) for mark in marks), 1e-3)
+        axes.set(xlim=(0.0, end), ylim=(0.0, 100.0), xlabel=f"Residual of {of} [{unit.strip()}]")
+    place.set_ylabel("Windows below [%]")
+    heading.tick_params(labelleft=False)
+    turned_deg = np.degrees(residuals.turn_rad)
+    groups = [one for one in np.array_split(np.argsort(turned_deg), TURN_GROUPS) if len(one) >= LEAST_TURNS]
+    for residual, look in zip(turns, looks, strict=True):
+        middle = [[float(np.median(column[one])) for one in groups] for column in (turned_deg, residual)]
+        turn.plot(*middle, marker="o", markersize=3.5, **look)
+    turn.axhline(0.0, **style.HALF_WIDTH)
+    turn.set(xlabel="Heading change, clockwise [°]", ylabel="Median residual [°]")
+    turn.set_title("residual by heading change\n(a slope: wrong multiplier)", loc="left", pad=5.0, fontsize=8.5)
+    sheet.legend()
     return sheet.finished()
 
 
@@ -257,6 +306,7 @@ class FleetNumbers(NamedTuple):
     errors_m : 95 % error after 10 m of each log, by group and name
     model : the model of these errors
     starts_utc : begin of each log by its name, where it is known
+    intervals_m : 95 % interval of the error of each log by its name, where it is known
     """
 
     title: str
@@ -264,6 +314,7 @@ class FleetNumbers(NamedTuple):
     errors_m: Mapping[str, Mapping[str, float]]
     model: str
     starts_utc: Mapping[str, str] = MappingProxyType({})
+    intervals_m: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
 
 def _dated(log: str, start_utc: str) -> str:
@@ -356,7 +407,8 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
     median = error_text(float(np.median([error for *_, error in errors])))
     labels = [_dated(log, fleet.starts_utc.get(log, "")) for _, log, _ in shown]
     title = f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}"
-    subtitle = f"{fleet.title}: 95 % error after 10 m without GNSS, {fleet.model}{cut}"
+    known = ", with its 95 % interval" if fleet.intervals_m else ""
+    subtitle = f"{fleet.title}: 95 % error after 10 m without GNSS{known}, {fleet.model}{cut}"
     height_in = 1.85 + ROW_IN * len(shown)
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=(3.1, 0.7, 0.65, 1.0))
     axes = sheet.subplots()[0, 0]
@@ -366,10 +418,14 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
         rows = [row for row, one in enumerate(shown) if one[0] == group]
         middle = error_text(float(np.median(list(logs.values()))))
         label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
-        axes.plot([shown[row][2] for row in rows], rows, markersize=5.5, label=label, **look)
+        axes.plot([shown[row][2] for row in rows], rows, markersize=5.5, label=label, zorder=3, **look)
+        for row in rows:
+            if (ends := fleet.intervals_m.get(shown[row][1])) is not None:
+                axes.plot(ends, [row, row], color=look["color"], linewidth=1.4, marker="|", markersize=6.0)
     centred: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False}
-    for row, (*_, error) in enumerate(shown):
-        style.write_near(axes, error_text(error), (error, row), (6.0, 0.0), **centred)
+    for row, (_, log, error) in enumerate(shown):
+        last = fleet.intervals_m.get(log, (error, error))[1]
+        style.write_near(axes, error_text(error), (last, row), (6.0, 0.0), **centred)
     style.logarithmic_errors(axes)
     sheet.legend(ncols=2)
     return sheet.finished()

@@ -1,4 +1,4 @@
-"""A drive, and the ICRs of a robot, from above: small drawings in the page itself, without a script, in its colours."""
+"""A drive and the ICRs of a robot from above, errors of groups: small drawings in the page, without a script."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats
 from icrtool.output.series import round_steps
+from icrtool.records.acceptance import CHOICE_HORIZON_M
+from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.run import ICR_COLUMNS, Run
 
@@ -125,3 +127,55 @@ def geometry_sketch(found: Calibration) -> Geometry:
         icrs, (WIDTH / 2.0 - scale * half, WIDTH / 2.0 + scale * half), (f"{y_left:+z.3f} m", f"{y_right:+z.3f} m"),
         bar_m * scale, bar_m,
     )  # fmt: skip
+
+
+class GroupError(NamedTuple):
+    """The error of a group on a scale: x of the number and of the ends of its interval, y [units of the drawing].
+
+    `low`, `high`: None where there is no interval.
+    """
+
+    name: str
+    x: float
+    low: float | None
+    high: float | None
+    y: float
+
+
+class GroupErrors(NamedTuple):
+    """The errors of groups, a row each, over one scale from zero.
+
+    Attributes
+    ----------
+    ticks : x of each tick [units of the drawing] and its number [m]
+    width, height : of the drawing
+    """
+
+    rows: tuple[GroupError, ...]
+    ticks: tuple[tuple[float, str], ...]
+    width: float
+    height: float
+
+
+ROW_HEIGHT, TICKS = 44.0, 4.0
+"""Height of a group's row [units of the drawing], and approximate number of ticks of the scale."""
+
+
+def group_sketch(found: GroupComparison) -> GroupErrors:
+    """Return the 95 % errors of the groups at `CHOICE_HORIZON_M`, each by its own calibration, with 95 % intervals."""
+    own = [
+        one
+        for one in found.transfer
+        if one.horizon_m == CHOICE_HORIZON_M and one.calibrated_on == one.tested_on and one.p95_m is not None
+    ]
+    end_m = max((one.p95_high_m or one.p95_m or 0.0 for one in own), default=0.0) or 1.0
+    step_m = float(min(round_steps(end_m / TICKS), key=lambda one: abs(one - end_m / TICKS)))
+    scale = (WIDTH - 3.0 * MARGIN) / end_m
+    rows = []
+    for number, one in enumerate(own):
+        ends = (None if end is None else round(MARGIN + scale * end, 1) for end in (one.p95_low_m, one.p95_high_m))
+        x, y = round(MARGIN + scale * (one.p95_m or 0.0), 1), ROW_HEIGHT * (number + 0.75)
+        rows.append(GroupError(one.tested_on, x, *ends, y))
+    counts = range(math.floor(end_m / step_m) + 1)
+    ticks = tuple((round(MARGIN + scale * step_m * count, 1), f"{step_m * count:g}") for count in counts)
+    return GroupErrors(tuple(rows), ticks, WIDTH, ROW_HEIGHT * len(rows) + 3.0 * MARGIN)

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from itertools import product
 from typing import NamedTuple
 
+import numpy as np
 from msgspec import UNSET
 
 from icrtool import __version__
@@ -24,12 +25,12 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS
 from icrtool.output.files.formats import csv_bytes
-from icrtool.output.tables.dropout import configuration_blocks, parameter_table, reach_row
+from icrtool.output.tables.dropout import WITH_GYRO, configuration_blocks, parameter_table, reach_row
 from icrtool.output.tables.run import blocks_of_numbers
 from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import controller_error_text, error_text, model_text, plus_minus
 from icrtool.records import calibration_document as documents
-from icrtool.records.acceptance import CHOICE_HORIZON_M
+from icrtool.records.acceptance import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.fleet_document import BUDGET_M
 from icrtool.records.plain_data import known
 from icrtool.records.rows import MAIN_ROW, in_order, shown_rows
@@ -74,13 +75,21 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
     icrs = [(found.geometry[name], found.geometry_std[name]) for name in ICR_COLUMNS]
     driven = distance_text(sum(log.distance_m for log in found.logs))
     about = f"{found.robot.name or 'robot'}: {counted(len(found.logs), 'log')}, {driven}, {model_text(found.fitted)}"
-    made = f"{about}. Made {found.created or 'at an unknown time'} with icrtool {found.tool_version or 'unknown'}."
+    day = found.created[:10] if found.created else "at an unknown time"
+    made = f"Made {day} with icrtool {found.tool_version or 'unknown'}."
     configuration: list[Block] = []
     with suppress(DataError):
         configuration = configuration_blocks(found, "CAL.json")
     unknown = "; ".join(TERMS[name].meaning for name in found.fitted.not_shown)
+    table = parameter_table(found.fitted, found.fitted_with_gyro)
+    # a reader knows the meaning, a file has the term
+    named = [
+        (f"{WITH_GYRO}{meaning}" if term.startswith(WITH_GYRO) else meaning, *middle, term.removeprefix(WITH_GYRO))
+        for term, *middle, meaning in (map(str, row) for row in table.rows)
+    ]
+    term, *middle, meaning = table.head
     parameters: list[Block] = [
-        parameter_table(found.fitted, found.fitted_with_gyro),
+        table._replace(rows=named, head=(meaning, *middle, term)),
         Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
         *sensor_tables(found),
     ]
@@ -91,10 +100,12 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
     ]
     return [
         Line(f"Not fit for use: {'; '.join(unfit)}" if unfit else "", "bad"),
-        Title(title, made),
+        Title(title, f"{about}.", made),
         Section("Answer", _calibration_cards(found, icrs), name="answer"),
         Section("Configuration to copy", configuration, name="controller"),
-        Section("Errors of each log that was not fitted", [_left_out_table(found)], name="held-out"),
+        Section(
+            "Errors of each log that was not fitted", [_held_out_table(found), _left_out_table(found)], name="held-out"
+        ),
         Section("Parameters of the motion model", parameters, name="parameters"),
         Section("Logs", [Table("lr", logs, head)], name="logs"),
         Section("Warnings", [Items(found.warnings) if found.warnings else "None."], name="warnings"),
@@ -118,28 +129,52 @@ def sensor_tables(calibration: Calibration) -> list[Block]:
 
 
 def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) -> list[Section]:
-    """Return error, numbers and a drawing of the ICRs as cards."""
-    horizons = sorted({one.horizon_m for one in found.held_out_pooled})
-    pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
-    rows = [
-        (name, *(_errors_text(pooled.get((name, horizon))) for horizon in horizons))
-        for name in in_order({one.model for one in found.held_out_pooled})
-    ]
-    head = ("95 % / expected [m]", *(f"{horizon:g} m" for horizon in horizons))
-    lead, text = "not known", "no distance was left out"
-    if (own := pooled.get((MAIN_ROW, CHOICE_HORIZON_M))) is not None:
-        lead = error_text(own.p95_m)
-        text = f"after {CHOICE_HORIZON_M:g} m (95 %) with {MAIN_ROW}, on distance that was not fitted"
+    """Return distance and errors, numbers and a drawing of the ICRs as cards."""
     numbers = blocks_of_numbers(found.controller, found.width_m, icrs)
     if alone := controller_error_text(found.controller_errors):
         numbers.append(alone)
     title = "The ICRs of the tracks from above, forward up"
     drawing = Figure((), "geometry", (Chart("geometry", title, f"{title}; bars: ±σ; boxes: the tracks."),))
     return [
-        Section("How large is the error?", [Table("lr", rows, head)], lead=lead, text=text, name="reach"),
+        _reach_card(found),
         Section("Which numbers into the controller?", numbers, name="factors"),
         Section("Where are the ICRs?", [drawing], name="worst-case"),
     ]
+
+
+def _reach_card(found: Calibration) -> Section:
+    """Return how far the robot stays within the budget on distance that was not fitted, and the errors there."""
+    horizons = sorted({one.horizon_m for one in found.held_out_pooled})
+    pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
+    names = in_order({one.model for one in found.held_out_pooled})
+    what = "each log left out in turn" if len(found.logs) > 1 else "each block of distance left out in turn"
+    reached: dict[str, BudgetDistance] = {}
+    for name in names:
+        errors = np.array([pooled[name, h].p95_m if (name, h) in pooled else math.nan for h in horizons])
+        if (distance := within_budget(np.array(horizons), errors, BUDGET_M)) is not None:
+            reached[name] = BudgetDistance(name, BUDGET_M, *distance)
+    lead, text = "not known", "no distance was left out"
+    if (own := reached.get(MAIN_ROW)) is not None:
+        _, lead, _, between = reach_row(own)
+        text = f"within {BUDGET_M:g} m (95 %), by wheel speeds alone with {MAIN_ROW}, {what}"
+        text += f": the errors were measured at {', '.join(f'{h:g}' for h in horizons)} m, so it is {between}" * bool(
+            between
+        )
+    # A table of distances as `icrtool calibrate` prints it.
+    distances = [reach_row(reached[name]) for name in shown_rows(names) if name in reached]
+    rows = [(name, distance, note) for name, distance, _, note in distances]
+    table = Table("lrl", rows, (f"within {BUDGET_M:g} m (95 %)", "distance", ""))
+    return Section("How far without GNSS?", [table], lead=lead, text=text, name="reach")
+
+
+def _held_out_table(found: Calibration) -> Table:
+    """Return p95 and expected error by horizon of each row, over all that was left out."""
+    horizons = sorted({one.horizon_m for one in found.held_out_pooled})
+    pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
+    names = in_order({one.model for one in found.held_out_pooled})
+    rows = [(name, *(_errors_text(pooled.get((name, horizon))) for horizon in horizons)) for name in names]
+    caption = "95 % / expected error [m] of each row, over all that was left out"
+    return Table("lr", rows, ("row", *(f"{horizon:g} m" for horizon in horizons)), caption)
 
 
 def _left_out_table(found: Calibration) -> Table:

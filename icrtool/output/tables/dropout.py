@@ -188,11 +188,10 @@ def _distance_to_plan_with(report: DropoutDocument, budget_m: float, row: ReachR
     name, this_drive, next_drive, _ = row
     measured = f"within {budget_m:g} m (95 %), by wheel speeds alone with {name}"
     found = next((one for one in report.budgets if (one.model, one.budget_m) == (name, budget_m)), None)
-    if found is None or not next_drive:
+    if found is None or found.to_plan_with_m is None:
         return this_drive, f"on this drive {measured}"
-    sure_m = found.distance_m if found.next_low_m is None else found.next_low_m
     then = f"{next_drive} on the next drive on this ground (9 of 10), {this_drive} on this drive"
-    return f"plan with {distance_text(sure_m)}", f"{measured}: {then}"
+    return f"plan with {distance_text(found.to_plan_with_m)}", f"{measured}: {then}"
 
 
 def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
@@ -341,10 +340,14 @@ def model_section(report: DropoutDocument) -> Section:
     return Section("The motion model", blocks, VERBOSE, name="models")
 
 
+WITH_GYRO = "with gyro: "
+"""Before the names of parameters of a model with a gyro."""
+
+
 def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:
     """Return the parameters of a model with one standard deviation each, and the parameters of its form with a gyro."""
     rows = [
-        (name if one is fitted else f"with gyro: {name}", plus_minus(value, std, 4),
+        (name if one is fitted else f"{WITH_GYRO}{name}", plus_minus(value, std, 4),
          "not shown" if name in one.not_shown else "shown", TERMS[name].meaning)
         for one in (fitted, gyro) if one is not None
         for name, value, std in zip(one.model.terms, one.parameters, one.std, strict=True)

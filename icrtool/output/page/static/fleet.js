@@ -37,6 +37,13 @@
     count.textContent = `${shown} of ${rows.length} logs`;
   }
 
+  // On a narrow screen a row stands as a block, each number under the name of its column.
+  for (const one of document.querySelectorAll("#robots table, #table")) {
+    const names = [...one.tHead.rows[0].cells].map((cell) => cell.textContent);
+    one.classList.add("stacked");
+    for (const row of one.tBodies[0].rows) [...row.cells].forEach((cell, column) => { if (cell.tagName === "TD") cell.dataset.head = names[column]; });
+  }
+
   heads.forEach((head, column) => {
     const button = document.createElement("button");
     button.type = "button";
