@@ -196,9 +196,11 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
             name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, {})[row.log] = error
     make_folders(folder / PLOTS, folder)
-    ends = [(row.log, *(row.errors.get(error_name.replace("_p95_", f"_p95_{end}_")) for end in ("low", "high")))
-            for row in rows]  # fmt: skip
-    intervals = {log: (low, high) for log, low, high in ends if low is not None and high is not None}
+    intervals: dict[str, tuple[float, float]] = {}
+    for row in rows:
+        low, high = (row.errors.get(error_name.replace("_p95_", f"_p95_{end}_")) for end in ("low", "high"))
+        if low is not None and high is not None:
+            intervals[row.log] = low, high
     dates = {row.log: row.start_utc for row in rows}
     numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model, dates, intervals)
     old = set(pictures_of_batch(folder))

@@ -58,6 +58,19 @@ def test_a_batch_with_limits_writes_what_a_job_passes_on(place: Path) -> None:
     assert row["baseline"]["icr_p95_5m_m"] == row["errors"]["icr_p95_5m_m"]
 
 
+def test_a_batch_has_the_intervals_and_the_next_drive_of_each_report(place: Path) -> None:
+    row = json.loads((place / "results" / "fleet.json").read_bytes())["logs"][0]
+    report = json.loads((place / "results" / row["run"] / "dropout" / "report.json").read_bytes())
+    for model in report["models"]:
+        (at,) = (one for one in model["by_horizon"] if one["horizon_m"] == 10.0)
+        for end in ("low", "high"):
+            assert row["errors"][f"{model['name']}_p95_{end}_10m_m"] == at[f"p95_{end}_m"]
+    assert report["budgets"]
+    for one in report["budgets"]:
+        expected = one["next_low_m"] if one["next_low_m"] is not None or not one["beyond"] else one["distance_m"]
+        assert row["errors"][f"{one['model']}_next_low_{one['budget_m']:g}m_m"] == expected
+
+
 def test_a_gate_beyond_the_interval_fails_and_says_where(place: Path, icrtool, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.chdir(place)
     run = place / "icrtool-runs" / "field"

@@ -583,6 +583,46 @@ def test_the_table_of_a_fleet_has_date_duration_and_distance_without_scrolling(c
     assert "error, icr" in page.evaluate(heads)
 
 
+def test_a_log_of_a_fleet_is_a_block_on_a_phone_with_interval_and_next_drive(chrome: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    errors = {
+        "recommended_p95_10m_m": 0.5, "recommended_p95_low_10m_m": 0.4, "recommended_p95_high_10m_m": 0.7,
+        "recommended_within_0.5m_m": 10.0, "recommended_next_low_0.5m_m": 4.5,
+    }  # fmt: skip
+    logs = [{**LOG, "errors": errors}, {**LOG, "log": "c.bag", "errors": errors}]
+    file.write_text(page_of_fleet({**FLEET, "logs": logs}, tmp_path), encoding="utf-8")
+    for width, one_line in ((1280, True), (390, False)):
+        page = chrome.page(width=width, height=844)
+        page.open(file)
+        box = "[...document.querySelectorAll('#table tbody td')].find((one) => one.textContent.startsWith('{}'))"
+        texts = [page.evaluate(f"{box.format(text)}.textContent") for text in ("0.500", "≥")]
+        assert [one.replace("\u2011", "-").replace("\xa0", " ") for one in texts] == ["0.500 m0.400-0.700 m", "≥ 4.5 m"]
+        assert page.evaluate(f"{box.format('0.500')}.getBoundingClientRect().right") <= width
+        tops = [page.evaluate(f"{box.format(text)}.getBoundingClientRect().top") for text in ("done", "0.500")]
+        assert (tops[0] == tops[1]) is one_line
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_the_first_screen_of_a_comparison_has_errors_with_intervals_as_numbers_and_drawn(
+    chrome: Browser, tmp_path: Path
+) -> None:
+    file = tmp_path / "comparison.html"
+    file.write_text(comparison_page(msgspec.convert(COMPARISON, GroupComparison), "c"), encoding="utf-8")
+    for width, height in ((1280, 800), (390, 844)):
+        page = chrome.page(width=width, height=height)
+        page.open(file)
+        rows = "[...document.querySelectorAll('.card.reach tbody tr')].map((row) => row.textContent)"
+        assert next(one.replace("\xa0", " ") for one in page.evaluate(rows)) == "grass0.50 m0.33 to 1.00 m"
+        assert page.evaluate("document.querySelector('.of-groups').getBoundingClientRect().bottom") < height
+        # 10 m: 0.333 to 1 m about 0.5 m, from zero on one scale
+        low, x, high = page.evaluate(
+            "(one => [one.querySelector('.worst').getBBox().x, +one.querySelector('circle').getAttribute('cx'),"
+            " one.querySelector('.worst').getBBox().x + one.querySelector('.worst').getBBox().width])"
+            "(document.querySelector('.of-groups'))"
+        )
+        assert ((x - low) / (high - x)) == pytest.approx((0.5 - 1 / 3) / 0.5, abs=0.01)
+
+
 def test_the_table_of_a_fleet_sorts_and_filters(chrome: Browser, tmp_path: Path) -> None:
     (tmp_path / "runs" / "b").mkdir(parents=True)
     (tmp_path / "runs" / "b" / "report.html").touch()

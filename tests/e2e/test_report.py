@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -220,7 +221,8 @@ def test_a_calibration_is_refused_for_the_page_of_a_finished_run(
 
 
 def test_a_calibration_has_a_page(icrtool: Command, run_directory: Path) -> None:
-    assert icrtool("calibrate", run_directory, "-o", "season.json", "-q")[0] == 0
+    status, printed, _ = icrtool("calibrate", run_directory, "-o", "season.json")
+    assert status == 0
     document = json.loads(Path("season.json").read_bytes())
     status, output, errors = icrtool("report", "season.json")
     assert (status, errors) == (0, "")
@@ -230,8 +232,17 @@ def test_a_calibration_has_a_page(icrtool: Command, run_directory: Path) -> None
     assert f"{controller['multiplier']:.3f} ± {controller['multiplier_std']:.3f}" in page
     held_out = next(one for one in document["held_out_pooled"] if (one["model"], one["horizon_m"]) == ("no_slip", 10))
     assert f"{held_out['p95_m']:.2f} / {held_out['expected_m']:.2f}" in page
-    for name in document["terms"]:
-        assert name.replace("_", "_<wbr>") in page
+    assert all(name in page for name in document["terms"])
+    # The distances that calibrate prints are those of the page.
+    lines = printed.partition("How far")[2].splitlines()[1:]
+    distances = [
+        re.split("  +", line.strip()) for line in lines[: next(k for k, one in enumerate(lines) if one[0] != " ")]
+    ]
+    assert len(distances) >= 3
+    card = page.partition("card fact reach")[2].partition("</article>")[0]
+    rows = [[re.sub("<[^>]*>", "", cell) for cell in re.findall("<t[hd].*?</t[hd]>", row)]
+            for row in re.findall("<tr.*?</tr>", card, re.DOTALL)]  # fmt: skip
+    assert [[cell for cell in row if cell] for row in rows[1:]] == distances
     assert "diff_drive_controller" in page
     assert document["logs"][0]["name"] in page
     Path("season.json").write_text(json.dumps(document | {"parameters": {}}), encoding="utf-8")

@@ -173,9 +173,11 @@ def group_sketch(found: GroupComparison) -> GroupErrors:
     scale = (WIDTH - 3.0 * MARGIN) / end_m
     rows = []
     for number, one in enumerate(own):
-        ends = (None if end is None else round(MARGIN + scale * end, 1) for end in (one.p95_low_m, one.p95_high_m))
-        x, y = round(MARGIN + scale * (one.p95_m or 0.0), 1), ROW_HEIGHT * (number + 0.75)
-        rows.append(GroupError(one.tested_on, x, *ends, y))
+        low, x, high = (
+            None if error is None else round(MARGIN + scale * error, 1)
+            for error in (one.p95_low_m, one.p95_m, one.p95_high_m)
+        )
+        rows.append(GroupError(one.tested_on, x or MARGIN, low, high, ROW_HEIGHT * (number + 0.75)))
     counts = range(math.floor(end_m / step_m) + 1)
     ticks = tuple((round(MARGIN + scale * step_m * count, 1), f"{step_m * count:g}") for count in counts)
     return GroupErrors(tuple(rows), ticks, WIDTH, ROW_HEIGHT * len(rows) + 3.0 * MARGIN)

@@ -50,7 +50,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
     driven = distance_text(sum(log.distance_m for log in calibration.logs))
     what = "log" if table.folds[0].whole else "block of distance"
     rows = [
-        reach_row(reached)
+        _held_out_distance(reached)
         for name in shown_rows(table.rows)
         if (reached := table.score(name).within(table.horizons_m, BUDGET_M)) is not None
     ]
@@ -68,6 +68,12 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
         Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
         Section(f"Motion model: {model_text(calibration.fitted)}", model, VERBOSE),
     ]
+
+
+def _held_out_distance(reached: BudgetDistance) -> tuple[str, str, str]:
+    """Return name, distance and note of a row; held-out errors have no interval for the next drive."""
+    name, distance, _, note = reach_row(reached)
+    return name, distance, note
 
 
 def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
@@ -161,8 +167,7 @@ def _reach_card(found: Calibration) -> Section:
             between
         )
     # A table of distances as `icrtool calibrate` prints it.
-    distances = [reach_row(reached[name]) for name in shown_rows(names) if name in reached]
-    rows = [(name, distance, note) for name, distance, _, note in distances]
+    rows = [_held_out_distance(reached[name]) for name in shown_rows(names) if name in reached]
     table = Table("lrl", rows, (f"within {BUDGET_M:g} m (95 %)", "distance", ""))
     return Section("How far without GNSS?", [table], lead=lead, text=text, name="reach")
 

@@ -82,6 +82,13 @@ def test_every_log_of_a_fleet_has_its_name_and_its_error() -> None:
     assert names == [f"{number}.bag" for number in range(99, 59, -1)]
 
 
+def test_the_interval_of_the_error_of_a_log_is_a_line_from_end_to_end() -> None:
+    logs = {"barn": {"monday.bag": 0.31, "tuesday.bag": 0.62}}
+    (axes,) = fleet_errors(FleetNumbers("2 logs", [], logs, "recommended", {}, {"monday.bag": (0.2, 0.5)})).axes
+    lines = [line.get_xydata().tolist() for line in axes.lines]
+    assert lines == [[[0.62, 0.0], [0.31, 1.0]], [[0.2, 1.0], [0.5, 1.0]]]
+
+
 def test_settings_of_matplotlib_that_are_no_text_are_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "matplotlibrc").write_bytes(b"axes.grid: \xff")
     code = "import icrtool.figures"

@@ -15,7 +15,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import OutputError, RunError
 from icrtool.output.exports.acceptance import format_outcomes, suite_of, write_junit
 from icrtool.output.files.atomic import check_place
-from icrtool.output.tables.dropout import format_dropout, p95_at, reach_rows
+from icrtool.output.tables.dropout import format_dropout, p95_at, reach_rows, reach_section
 from icrtool.output.tables.errors import shown_horizons
 from icrtool.output.text_format import error_text
 from icrtool.records.acceptance import BudgetDistance
@@ -128,6 +128,24 @@ def test_a_distance_below_a_metre_between_far_horizons_is_not_zero() -> None:
     assert short.short_text == "less than 1 m"
     assert msgspec.structs.replace(short, distance_m=1.4).short_text == "about 1 m"
     assert msgspec.structs.replace(short, between_m=(0.0, 1.0)).short_text == "0.3 m"
+
+
+def test_the_distance_to_plan_with_is_the_lower_end_of_the_next_drive() -> None:
+    known = BudgetDistance("icr", 0.5, 18.2, beyond=False, between_m=(18.0, 19.0), next_low_m=2.7)
+    assert known.to_plan_with_m == 2.7
+    assert msgspec.structs.replace(known, next_low_m=None).to_plan_with_m is None
+    assert msgspec.structs.replace(known, next_low_m=None, distance_m=20.0, beyond=True).to_plan_with_m == 20.0
+
+
+def test_a_page_begins_with_the_distance_to_plan_with(content: DropoutReport) -> None:
+    known = BudgetDistance("icr", 0.5, 18.2, beyond=False, between_m=(18.0, 19.0), next_low_m=2.7)
+    for next_low_m, lead in ((2.7, "plan with 2.7 m"), (None, "18.2 m")):
+        budgets = (msgspec.structs.replace(known, next_low_m=next_low_m),)
+        report = msgspec.structs.replace(content.document, budgets=budgets, best=None)
+        reach = reach_section(content.run_document, report)
+        assert reach.lead == lead
+        assert ("2.7 m or more on the next drive" in reach.text) is (next_low_m is not None)
+        assert ("18.2 m on this drive" in reach.text) is (next_low_m is not None)
 
 
 def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[..., Run]) -> None:

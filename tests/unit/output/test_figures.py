@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.text import Text
 
+from icrtool.alignment.estimator import ResidualsByEstimate
 from icrtool.calibration.error_growth import Forecast
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.filter_records import GATED
 from icrtool.output.figure_catalogue import FIGURES
-from icrtool.output.figures.calibrations import forecast_figure, transfer
+from icrtool.output.figures.calibrations import forecast_figure, residuals_figure, transfer
 from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.figures.style import new_figure, save_figure, style
 from icrtool.output.page.render import drawn_pictures
@@ -367,6 +369,36 @@ def test_a_long_title_is_cut_in_its_middle() -> None:
     assert title.endswith("end")
     assert "…" in title
     assert figure.texts[0].get_window_extent().x1 < figure.bbox.x1
+
+
+def test_the_circles_of_a_forecast_hold_its_95_percent_errors_at_round_distances() -> None:
+    metres = np.arange(1.0, 61.0)
+    forecast = Forecast(metres, metres, -metres, 0.01 * metres, 0.03 * metres, *np.tile(0.01 * metres, (3, 1)))
+    grown, path = forecast_figure(forecast, "path", (0.5,), 50.0).axes
+    filled = [one for one in path.patches if isinstance(one, Circle) and one.get_fill()]
+    found = sorted((*map(float, one.center), float(one.radius)) for one in filled)
+    assert found == [pytest.approx((metres, -metres, 0.03 * metres)) for metres in (10.0, 20.0, 30.0, 40.0, 50.0)]
+    assert [text.get_text() for text in path.texts] == [
+        "10 m: 0.300 m", "20 m: 0.600 m", "30 m: 0.900 m", "40 m: 1.20 m", "50 m: 1.50 m"
+    ]  # fmt: skip
+    # 0.5 m is reached at 0.5 / 0.03
+    assert [text.get_text() for text in grown.texts] == ["16.7 m"]
+    (beyond,) = grown.patches
+    assert (beyond.get_x(), beyond.get_x() + beyond.get_width()) == (50.0, 60.0)
+
+
+def test_residuals_are_drawn_as_shares_of_the_windows_and_by_heading_change() -> None:
+    rng = np.random.default_rng(7)
+    turn_rad = np.sort(rng.uniform(-1.0, 1.0, 80))
+    before, after = rng.normal(0.0, 0.2, (2, 80)), rng.normal(0.0, 0.1, (2, 80))
+    residuals = ResidualsByEstimate(before, after, 0.1 * turn_rad, 0.0 * turn_rad, turn_rad)
+    place, heading, turn = residuals_figure("log", residuals).axes
+    for line, part in zip(place.lines, (before, after), strict=True):
+        sizes, shares = line.get_xdata(), line.get_ydata()
+        assert np.interp(50.0, shares, sizes) == pytest.approx(np.median(np.hypot(*part)), rel=0.02)
+    assert heading.lines[0].get_xdata()[-1] == pytest.approx(np.degrees(0.1 * np.abs(turn_rad).max()))
+    slopes = [np.polyfit(line.get_xdata(), line.get_ydata(), 1)[0] for line in turn.lines[:2]]
+    assert slopes == pytest.approx([0.1, 0.0], abs=1e-9)
 
 
 def test_a_forecast_along_a_run_in_a_local_frame_has_x_and_y(make_run: Callable[..., Run]) -> None:
