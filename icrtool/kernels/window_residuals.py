@@ -138,7 +138,9 @@ def window_residuals(
     moved, by = displacements(path, start, end)
     turned = np.exp(-1j * offset) * reference
     residual = (shortened * moved - turned) / root
-    by = np.insert(shortened * by, len(by) - 1, 1j * turned, axis=0) / root
+    by *= shortened
+    by = np.concatenate([by[:-1], 1j * turned[None], by[-1:]])
+    by /= root
     return np.concatenate([residual.real, residual.imag]), np.concatenate([by.real, by.imag], axis=1).T
 
 

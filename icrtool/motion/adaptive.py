@@ -17,13 +17,24 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.elimination import normal_equations
+from icrtool.kernels.learning import Belief, LearnedWindows, learn, prepare
 from icrtool.kernels.robust import robust_weights, scale_by_kind
 from icrtool.kernels.track import Windows
 from icrtool.kernels.window_residuals import OMEGA
 from icrtool.motion.drive_buffer import LARGEST_ADVANCE_M, DriveBuffer
-from icrtool.motion.models import GYRO_TERMS, MODELS, RECOMMENDED, TERMS, FittedModel, MotionModel, wheel_motion
+from icrtool.motion.models import (
+    GYRO_TERMS,
+    MODELS,
+    RECOMMENDED,
+    TERMS,
+    FittedModel,
+    MotionModel,
+    WheelMotion,
+    wheel_motion,
+)
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, size_of
 from icrtool.motion.window_fit import (
+    CONSTANTS_OF_WHEELS,
     RESIDUAL_KINDS,
     UNKNOWN_CONSTANTS,
     KnownConstants,
@@ -31,6 +42,7 @@ from icrtool.motion.window_fit import (
     constant_std,
     heading_wander,
     residuals_of,
+    step_columns,
 )
 
 WINDOWS_AS_ONE = 80.0
@@ -141,6 +153,7 @@ class Estimate:
     Attributes
     ----------
     x : (k + c,) parameters, then `LogConstants`; mean, prior : (k + c,), (k + c, k + c) mean and information before
+    pull : (k + c,) information times mean before
     matrix, vector : (k + c, k + c), (k + c,) of the data: x solves (prior + matrix) x = prior mean + vector
     scale : (2,) robust standard deviation of the residuals of displacements and turns
     wander : of the heading, for each metre [rad^2/m]
@@ -155,6 +168,7 @@ class Estimate:
         self.mean = np.concatenate([mean, constants.mean[:own]])
         self.prior = np.diag(np.concatenate([np.zeros(k), np.array(constants.std[:own]) ** -2.0]))
         self.prior[:k, :k] = np.linalg.inv(covariance)
+        self.pull = self.prior @ self.mean
         self.matrix, self.vector = np.zeros_like(self.prior), np.zeros_like(self.mean)
         self.x, self.scale, self.wander = self.mean, np.array(USUAL_STD), 0.0
         self.fitted, self.constants = FittedModel(model, mean, covariance), LogConstants(*constants.mean[:own])
@@ -176,16 +190,21 @@ class Estimate:
             self.wander = heading_wander(turns * np.sqrt(windows.length_m), windows.length_m)
         self._finish(wheels)
 
-    def solve_with(self, windows: Windows, wheels: FittedModel | None = None) -> None:
-        """Solve with some further windows, linearised at the last solution."""
-        kind = np.repeat(RESIDUAL_KINDS, len(windows.begin))
-        at = self.x
-        residuals, jacobian = self._evaluated(residuals_of(windows, self.model, self.width_m, wheels, self.wander))
-        for _ in range(GAUSS_NEWTON_STEPS):
-            matrix, vector = self._equations(residuals, jacobian, kind, at)
-            self._step(self.matrix + matrix, self.vector + vector)
-        matrix, vector = self._equations(residuals, jacobian, kind, at)
-        self.matrix, self.vector = self.matrix + matrix, self.vector + vector
+    def solve_with(self, windows: Windows, motion: WheelMotion, wheels: FittedModel | None = None) -> None:
+        """Solve with some further windows, linearised at the last solution; `motion` of the windows' wheel samples."""
+        steps, k = windows.track, len(self.model.terms)
+        offset, delay = self.x[k : k + CONSTANTS_OF_WHEELS].tolist()
+        columns = step_columns(steps, motion, self.model, wheels)(self.x[:k], self.x[k:])
+        added = LearnedWindows(
+            steps.t, steps.held, steps.into, *columns, steps.place_t + delay, windows.begin, windows.end,
+            windows.moved, windows.turned, windows.length_m, offset, self.wander,
+        )  # fmt: skip
+        belief = Belief(
+            self.x, self.prior, self.pull, self.matrix, self.vector, self.scale, WINDOWS_AS_ONE,
+            LARGEST_DELAY_S,
+        )  # fmt: skip
+        found = learn(added, belief, k, GAUSS_NEWTON_STEPS)
+        self.x, self.matrix, self.vector = found.x, found.matrix, found.vector
         self._finish(wheels)
 
     def _evaluated(self, evaluate: Residuals) -> tuple[Floats, Floats]:
@@ -199,7 +218,7 @@ class Estimate:
         return normal_equations(jacobian @ at - residuals, jacobian, weights)
 
     def _step(self, matrix: Floats, vector: Floats) -> None:
-        x = np.linalg.solve(self.prior + matrix, self.prior @ self.mean + vector)
+        x = np.linalg.solve(self.prior + matrix, self.pull + vector)
         delay = len(self.model.terms) + LogConstants._fields.index("wheels_later_s")
         x[delay] = np.clip(x[delay], -LARGEST_DELAY_S, LARGEST_DELAY_S)
         if np.isfinite(x).all():
@@ -223,8 +242,8 @@ def _scale_of(residuals: Floats, kind: Ints) -> Floats:
 class AdaptiveModel:
     """A motion model that starts from a prior and learns from the samples of a drive as they come.
 
-    Frames and signs follow `icrtool`: x forward, y right, turns clockwise. It holds some kilobytes and opens no file or
-    log.
+    Frames and signs follow `icrtool`: x forward, y right, turns clockwise. It holds some kilobytes and opens no log.
+    The first model on a computer compiles a kernel, which takes seconds; later processes load it.
 
     Parameters
     ----------
@@ -237,6 +256,7 @@ class AdaptiveModel:
     """
 
     def __init__(self, prior: TermsPrior, *, with_gyro: bool = False) -> None:
+        prepare()
         self.prior, self.with_gyro, self.distance_m = prior, with_gyro, 0.0
         size = size_of(prior.width_m)
         self._drive, self._longest_m = DriveBuffer(size), LARGEST_ADVANCE_M * size
@@ -351,10 +371,14 @@ class AdaptiveModel:
         if anew := self._next_anew_m <= at_m <= REBUILT_TO_M * self._drive.size:
             self._next_anew_m = (1.0 + REBUILT_SHARE) * at_m
             windows = self._drive.windows(0, last, knot) or windows
-        wheels: FittedModel | None = None
+        steps, wheels = windows.track, None
+        motion = wheel_motion(steps.v_left, steps.v_right, self.prior.width_m, steps.gyro)
         for one in (self._wheels, self._turned):
-            if one is not None:
-                solve = one.solve_anew if anew else one.solve_with
-                solve(windows, wheels)
-                wheels = one.fitted
+            if one is None:
+                continue
+            if anew:
+                one.solve_anew(windows, wheels)
+            else:
+                one.solve_with(windows, motion, wheels)
+            wheels = one.fitted
         return True

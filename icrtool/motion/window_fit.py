@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.elimination import Parts, normal_equations
 from icrtool.kernels.robust import (
     Linearised,
@@ -31,9 +31,9 @@ from icrtool.kernels.robust import (
     soft_l1_weights,
     student_covariance,
 )
-from icrtool.kernels.track import Windows
+from icrtool.kernels.track import Track, Windows
 from icrtool.kernels.window_residuals import OMEGA, path_at, turn_residuals, window_residuals
-from icrtool.motion.models import FittedModel, MotionModel, model_columns, wheel_motion
+from icrtool.motion.models import FittedModel, MotionModel, WheelMotion, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, size_of
 
 LAST_DELAY_STEP_SIGMAS = 0.1
@@ -129,39 +129,70 @@ def residuals_of(
     seen, seen_turned = windows.moved, windows.turned
     knots, rows = np.unique([windows.begin, windows.end], return_inverse=True)
     knot_t, (start, end) = steps.place_t[knots], rows.reshape(2, -1)
-    motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
-    if wheels is not None:
-        motion = motion._replace(turn=wheels.twist(motion)[OMEGA])
-    of_model, axes, of_terms = model_columns(model, motion)
-    gyro_change, k = steps.gyro_change(), len(axes)
-    if model.uses_gyro:
-        # the gyro's bias and time are two more columns of the turn rate
-        axes = np.append(axes, [OMEGA, OMEGA])
-        of_terms = np.concatenate([of_terms, np.ones((2, len(steps.t)))])
-    # derivative of the gyro's weight in the turn rate by each parameter
-    gains = np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
+    columns_at = step_columns(steps, wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro), model, wheels)
 
     def evaluate(parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
         offset, delay = constants[:CONSTANTS_OF_WHEELS].tolist()
-        fixed, columns, values = of_model, of_terms, parameters
-        if model.uses_gyro:
-            bias, later = constants[CONSTANTS_OF_WHEELS:].tolist()
-            shift = later * gyro_change
-            fixed, columns, values = fixed.copy(), columns.copy(), np.concatenate([parameters, [bias, 0.0]])
-            fixed[OMEGA] += shift
-            columns[:k] += gains[:, None] * shift
-            columns[-1] = (1.0 + parameters @ gains) * gyro_change
+        fixed, axes, columns, values = columns_at(parameters, constants)
         path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, knot_t + delay)
         turned, turned_by = turn_residuals(path, start, end, seen_turned, root)
         strayed = heading_wander(turned * root, windows.length_m) if wander is None else wander
         share = shortening(strayed, windows.length_m)
         moved, moved_by = window_residuals(path, start, end, seen, offset, root, share)
         # from the order terms, gyro columns, offset, delay to the order terms, `LogConstants`
-        terms = len(axes)
+        k, terms = len(parameters), len(axes)
         jacobian = np.concatenate([moved_by, turned_by])[:, [*range(k), terms, terms + 1, *range(k, terms)]]
         return np.concatenate([moved, turned]), jacobian
 
     return evaluate
+
+
+class StepColumns(NamedTuple):
+    """What moves a path at each of n steps: p free terms, of them k of the model and those of the gyro's constants.
+
+    Attributes
+    ----------
+    fixed : (3, n) twist without the free terms; axes : (p,) axis of each free term
+    columns : (p, n) twist per unit of each free term; values : (p,) of the free terms
+    """
+
+    fixed: Floats
+    axes: Ints
+    columns: Floats
+    values: Floats
+
+
+def step_columns(
+    steps: Track, motion: WheelMotion, model: MotionModel, wheels: FittedModel | None = None
+) -> Callable[[Floats, Floats], StepColumns]:
+    """Return a function that gives the columns of a track's steps for parameters (k,) and constants (c,).
+
+    Parameters
+    ----------
+    motion : of the steps, with their gyro
+    model, wheels : as in `residuals_of`
+    """
+    if wheels is not None:
+        motion = motion._replace(turn=wheels.twist(motion)[OMEGA])
+    of_model, axes, of_terms = model_columns(model, motion)
+    if not model.uses_gyro:
+        return lambda parameters, _: StepColumns(of_model, axes, of_terms, parameters)
+    k, gyro_change = len(axes), steps.gyro_change()
+    # the gyro's bias and time are two more columns of the turn rate
+    axes = np.append(axes, [OMEGA, OMEGA])
+    of_terms = np.concatenate([of_terms, np.ones((2, len(steps.t)))])
+    # derivative of the gyro's weight in the turn rate by each parameter
+    gains = np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
+
+    def columns_at(parameters: Floats, constants: Floats) -> StepColumns:
+        bias, later = constants[CONSTANTS_OF_WHEELS:].tolist()
+        shift, fixed, columns = later * gyro_change, of_model.copy(), of_terms.copy()
+        fixed[OMEGA] += shift
+        columns[:k] += gains[:, None] * shift
+        columns[-1] = (1.0 + parameters @ gains) * gyro_change
+        return StepColumns(fixed, axes, columns, np.concatenate([parameters, [bias, 0.0]]))
+
+    return columns_at
 
 
 class Fold(NamedTuple):
