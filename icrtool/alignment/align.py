@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from icrtool.alignment.clock_search import NO_SHIFTS, take_shifts, with_configured_delays, with_shifts
@@ -25,7 +26,7 @@ from icrtool.alignment.sensor_noise import (
 from icrtool.alignment.slip_events import find_disagreements
 from icrtool.alignment.sparse_reference import without_interpolated
 from icrtool.alignment.wheel_alignment import bridged
-from icrtool.alignment.wheel_units import with_wheel_speeds
+from icrtool.alignment.wheel_units import with_right_size, with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.records.measurements import Finding, LogFacts, Measurements, SensorData
@@ -62,7 +63,8 @@ def align(log: RobotLog, config: Config) -> Measurements:
     if not config.filter.rules.corrects:
         # it takes its wheels as they are
         return _align_once(log, config)
-    log, width = without_bad_start(without_frozen(log)), width_or_usual_m(config.robot.track_width_m)
+    log, size = with_right_size(without_bad_start(without_frozen(log)), config)
+    width = width_or_usual_m(config.robot.track_width_m)
     log, config, shifts = take_shifts(log, config)
     found = _align_once(log, config)
     seen = find_disagreements(found.sensors, width)
@@ -75,8 +77,34 @@ def align(log: RobotLog, config: Config) -> Measurements:
     filled, bridge = bridged(found.sensors.wheels, config.filter.wheel_gap_s, found.sensors.fixes)
     notes = about(log.name, [*shifts.notes, *([] if bridge is None else [bridge])])
     sensors = replace(found.sensors, wheels=filled, events=seen.events, jumps=seen.jumps)
-    found = replace(found, findings=with_shifts(with_shifts(found.findings, given), shifts))
+    found = _with_size(replace(found, findings=with_shifts(with_shifts(found.findings, given), shifts)), size)
     return replace(found, sensors=sensors, notes=(*found.notes, *notes))
+
+
+def _with_size(found: Measurements, factor: float) -> Measurements:
+    """Return measurements whose scales count from the wheels as sent, which were multiplied with a factor first."""
+    if factor == 1.0:
+        return found
+    facts = found.wheels
+    wheels = msgspec.structs.replace(
+        facts,
+        scale=None if facts.scale is None else factor * facts.scale,
+        scale_std=None if facts.scale_std is None else factor * facts.scale_std,
+        applied_scale=factor * facts.applied_scale,
+        applied_left_scale=factor * facts.applied_left_scale,
+        applied_right_scale=factor * facts.applied_right_scale,
+    )
+    scaled = {
+        name: Finding(
+            None if one.value is None else factor * one.value,
+            None if one.std is None else factor * one.std,
+            factor * one.applied,
+            "corrected",
+        )
+        for name in ("wheel_scale", "left_scale", "right_scale")
+        if (one := found.findings.get(name)) is not None
+    }
+    return replace(found, wheels=wheels, findings={**found.findings, **scaled})
 
 
 def _align_once(log: RobotLog, config: Config) -> Measurements:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
@@ -10,9 +11,10 @@ import numpy as np
 
 from icrtool.alignment.log_track import IMPOSSIBLE_M
 from icrtool.config import Config
-from icrtool.kernels.arrays import Bools, Floats, Ints, unwrapped
+from icrtool.kernels.arrays import Bools, Floats, Ints, trapezoids, unwrapped
 from icrtool.records.measurements import Finding
 from icrtool.records.notes import Note, note
+from icrtool.records.samples import GyroAxes
 from icrtool.records.tables import RobotLog
 
 LONGEST_SHIFT_S, SHORTEST_SHIFT_S = 30.0, 3.0
@@ -77,16 +79,34 @@ def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Con
     if gnss == heading == 0.0:
         return log, config, NO_SHIFTS
     inner = replace(config, frames=replace(frames, **cast("dict[str, Any]", dict.fromkeys(given, 0.0))))
-    return _moved(log, gnss, heading), inner, Shifts(gnss, heading, ())
+    return _moved(log, config, gnss, heading), inner, Shifts(gnss, heading, ())
 
 
-def _moved(log: RobotLog, gnss_s: float, heading_s: float) -> RobotLog:
-    """Return a log whose fixes and headings are stamped earlier by some seconds."""
+def _moved(log: RobotLog, config: Config, gnss_s: float, heading_s: float) -> RobotLog:
+    """Return a log whose fixes and headings are stamped earlier by some seconds.
+
+    Turn rates in the messages of the headings have their clock, and are moved with them. Less than `SHORTEST_SHIFT_S`
+    may be the delay of a filter, which turn rates do not have.
+    """
     moved: dict[str, Any] = {
         name: replace(stream, stamp_ns=stream.stamp_ns - round(by * 1e9))
         for name, stream, by in (("gnss", log.gnss, gnss_s), ("heading", log.heading, heading_s))
     }
-    return replace(log, **moved)
+    log = replace(log, **moved)
+    if abs(heading_s) <= SHORTEST_SHIFT_S or config.frames.gyro_delay_s != "auto":
+        return log
+    return _with_gyros_moved(log, {log.topic("heading"): heading_s})
+
+
+def _with_gyros_moved(log: RobotLog, by_s: Mapping[str, float]) -> RobotLog:
+    """Return a log whose turn rates are stamped earlier by some seconds for each topic."""
+
+    def at(stamp_ns: Ints, topic: str) -> Ints:
+        return stamp_ns - round(by_s.get(topic, 0.0) * 1e9)
+
+    gyros = tuple(replace(one, stamp_ns=at(one.stamp_ns, one.topic)) for one in log.gyros)
+    gyro = None if log.gyro is None else replace(log.gyro, stamp_ns=at(log.gyro.stamp_ns, log.gyro.topic))
+    return replace(log, gyros=gyros, gyro=gyro)
 
 
 def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts]:
@@ -111,10 +131,15 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
             notes.append(note("clock_shifted", _sentence(word, shifts[word], key)))
     if log.heading_is_of_position:
         shifts["heading"] = shifts["gnss"]
+    if own is not None and config.frames.gyro_delay_s == "auto":
+        others = [one for one in log.gyros if one.topic != log.topic("heading")]
+        of_gyros = {one.topic: shift for one in others if (shift := find_shift(own, _Rates.of_gyro(one, log)))}
+        notes += [note("clock_shifted", _sentence("gyro", shift, "gyro_delay_s")) for shift in of_gyros.values()]
+        log = _with_gyros_moved(log, of_gyros) if of_gyros else log
     if not any(shifts.values()):
-        return log, config, given
+        return log, config, given._replace(notes=tuple(notes))
     total = Shifts(given.gnss + shifts["gnss"], given.heading + shifts["heading"], tuple(notes))
-    return _moved(log, shifts["gnss"], shifts["heading"]), config, total
+    return _moved(log, config, shifts["gnss"], shifts["heading"]), config, total
 
 
 def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Finding]:
@@ -134,7 +159,7 @@ def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Findi
 
 def _sentence(word: str, shift_s: float, key: str) -> str:
     """Return the finding about a stream's clock, and the correction."""
-    subject = "positions" if word == "gnss" else "headings"
+    subject = {"gnss": "positions", "heading": "headings"}.get(word, "the turn rates of the gyro")
     fact = f"{subject} are stamped {abs(shift_s):.1f} s {'later' if shift_s > 0 else 'earlier'} than the wheels"
     leap = abs(abs(shift_s) - LEAP_S) < 2 * GRID_S
     cause = " (GPS time is 18 s ahead of UTC)" if leap else ""
@@ -190,6 +215,17 @@ class _Rates(NamedTuple):
             return cls(None, None)
         turn = _rate(heading.stamp_ns, unwrapped(heading.heading_rad), log)
         return cls(None, np.where(_known(heading.stamp_ns, log), turn, np.nan))
+
+    @classmethod
+    def of_gyro(cls, gyro: GyroAxes, log: RobotLog) -> _Rates:
+        """Return the turn rate about the axis of a gyro about which it turns most."""
+        if len(gyro.stamp_ns) < 2:
+            return cls(None, None)
+        t = (gyro.stamp_ns - gyro.stamp_ns[0]) / 1e9
+        angles = [trapezoids(t, rate) for rate in np.nan_to_num(gyro.rates_radps).T]
+        known = _known(gyro.stamp_ns, log)
+        rates = [np.where(known, _rate(gyro.stamp_ns, angle, log), np.nan) for angle in angles]
+        return cls(None, max(rates, key=lambda rate: float(np.nanvar(rate)) if known.any() else 0.0))
 
 
 def _grid(log: RobotLog) -> Ints:

@@ -8,7 +8,6 @@ corrects it by an absolute heading, the difference stays bounded for any duratio
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -20,6 +19,7 @@ from icrtool.alignment.ground_change import find_changes
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.alignment.sparse_reference import spans_of_measured
+from icrtool.alignment.wheel_units import Scale, is_wrong_size, radius_hint
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, rows_at_steps, unwrapped
 from icrtool.kernels.robust import robust_regression, sandwich_covariance
@@ -51,9 +51,6 @@ SMALLEST_SIDE_DIFFERENCE = 0.005
 
 LARGEST_SCALE_CORRECTION = 0.15
 """Largest correction of a scale that tyres and soil explain."""
-
-FACTOR_TWO_TOLERANCE = 2.0 * USUAL_SCALE_STD
-"""Largest relative difference of a scale from 2 or 1/2 (diameter for radius) at which it is also corrected."""
 
 LONGEST_BRIDGE_S = 5.0
 """Longest gap that is bridged [s]. In a longer gap the robot may have stopped and turned."""
@@ -181,7 +178,7 @@ def align_wheels(
     change = None if fit is None or not sound else find_changes(fit)
     filtered = "" if fit is None or not sound or change is not None else find_filtering(fit)
     if fit is not None and not filtered:
-        applied, notes = _find_scales(fit, config, _radius_hint(log, config, fit.estimate("scale")[0]), sound=sound)
+        applied, notes = _find_scales(fit, config, log, sound=sound)
     moving = (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))[1:] > 0
     same = (np.diff(wheels.v_left_mps) == 0) & (np.diff(wheels.v_right_mps) == 0)
     share = float(same[moving].mean()) if np.count_nonzero(moving) >= FEWEST_ALIGNMENT_WINDOWS else 0.0
@@ -231,27 +228,10 @@ def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
     return float(left.sum() / turned.sum()), std
 
 
-def _radius_hint(log: RobotLog, config: Config, scale: float) -> str:
-    """Return a text on the wheel radius that the log shows; empty where the wheel speeds need no radius."""
-    radius_m = config.robot.wheel_radius_m
-    by_radius = any(one.role == "wheels" and _ANGLES.search(one.why) for one in log.streams)
-    if radius_m is None or not by_radius:
-        return ""
-    robot = f"{config.robot.name} has {radius_m:g} m" if config.robot.name else f"{radius_m:g} m is configured"
-    question = "is --robot right? check" if config.robot.name else "check"
-    return f"the log shows a wheel radius of {scale * radius_m:.3f} m, {robot}: {question} "
-
-
-_ANGLES = re.compile(r" in (rad|counts)")
-"""Words in the `why` of a stream whose speeds were computed with the configured wheel radius."""
-
-
 def _find_scales(
-    fit: AlignmentFit, config: Config, radius: str, *, sound: bool
+    fit: AlignmentFit, config: Config, log: RobotLog, *, sound: bool
 ) -> tuple[tuple[float, float], list[Note]]:
     """Return the factors to apply to the speeds of the left and of the right side, and findings.
-
-    `radius`: what the scale states of the wheel radius, empty where it states nothing.
 
     Notes
     -----
@@ -272,12 +252,15 @@ def _find_scales(
         if small := error <= LARGEST_SCALE_CORRECTION:
             scale = 1.0 + (scale - 1.0) * kept
         text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
-        if may and (small or any(abs(scale / value - 1.0) < FACTOR_TWO_TOLERANCE for value in (0.5, 2.0))):
+        check = f"{radius_hint(log, config, scale)}wheel radius, encoder resolution and units"
+        if may and small:
             factor = scale
             done = "corrected; wheels.left_scale and right_scale set it"
             notes.append(note("wheel_scale_corrected", f"{text}: {done}"))
+        elif may and is_wrong_size(Scale(scale, std), log):
+            factor = scale
+            notes.append(note("wheel_size_wrong", f"{text}: corrected; {check}"))
         else:
-            check = f"{radius or 'check '}wheel radius, encoder resolution and units"
             notes.append(note("wheel_scale_differs", f"{text}: {check}"))
     (asymmetry, asymmetry_std), (turn, turn_std) = fit.estimate("asymmetry"), fit.estimate("turn")
     if turn <= 0.0:

@@ -6,12 +6,14 @@ A robot that does not move, for example on a stand, shows no unit and is refused
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.estimator import EVIDENCE_SIGMAS
 from icrtool.alignment.log_track import (
     FEWEST_ALIGNMENT_WINDOWS,
     LEAST_CHORD_M,
@@ -25,6 +27,7 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.robust import mad_std
 from icrtool.records.notes import Note, about, note
+from icrtool.records.run import ROLLING_SCALE
 from icrtool.records.samples import NO_HEADINGS, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
@@ -57,6 +60,13 @@ size by less."""
 OTHER_UNIT_TOLERANCE = 0.1
 """The same difference for another unit than the message type's. It is smaller: slip of 90 % would look like rpm."""
 
+
+FACTOR_TWO_TOLERANCE = 0.08
+"""Largest relative difference of a scale from 2 or 1/2, diameter for radius, at which it is that factor."""
+
+LARGEST_SIZE_STD = 0.04
+"""Largest standard deviation of the factor of a wrong wheel size, as a share of it. Slip that varies gives a
+larger one."""
 
 STANDS_SHARE, STILL = 0.8, 0.2
 """Share of the windows with a small displacement, and the largest ratio of a small displacement to the wheels', at
@@ -124,6 +134,56 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     kept = tuple(np.intersect1d(restarts, stamps).tolist())
     samples = WheelSamples(stamps, left, right, from_position=wheels.from_position, restarts_ns=kept)
     return replace(log, wheels=samples, streams=streams, notes=(*log.notes, *about(log.name, notes)))
+
+
+def with_right_size(log: RobotLog, config: Config) -> tuple[RobotLog, float]:
+    """Return the log with wheel speeds of the right size, and the factor they were multiplied with; 1 for none.
+
+    A constant factor that tyres and soil do not explain is the factor of a wrong radius, resolution, gear or unit: slip
+    is not the same in every span. Configured scales are left as they are.
+    """
+    wheels, given = log.wheels, config.wheels
+    if given.left_scale != "auto" or given.right_scale != "auto":
+        return log, 1.0
+    scale = reference_scale(wheels.stamp_ns, wheels.v_left_mps, wheels.v_right_mps, log.gnss)
+    if scale is None or abs(scale.value - 1.0) <= ROLLING_SCALE + EVIDENCE_SIGMAS * scale.std:
+        return log, 1.0
+    if not is_wrong_size(scale, log):
+        return log, 1.0
+    factor = scale.value
+    size = replace(wheels, left=factor * wheels.v_left_mps, right=factor * wheels.v_right_mps)
+    text = (
+        f"the robot goes {_with_std(Scale(100.0 * factor, 100.0 * scale.std))} % of the distance that the wheels report"
+    )
+    check = f"corrected; {radius_hint(log, config, factor)}wheel radius, encoder resolution, gear and units"
+    found = about(log.name, [note("wheel_size_wrong", f"{text}: {check}")])
+    return replace(log, wheels=size, notes=(*log.notes, *found)), factor
+
+
+def is_wrong_size(scale: Scale, log: RobotLog) -> bool:
+    """Return whether a scale beyond tyres and soil is a constant factor of the wheels.
+
+    Where the reference is no GNSS, its own unit or scale may be wrong, as in visual SLAM: then only a factor of two,
+    which is a diameter in place of a radius, is the wheels'.
+    """
+    if not (scale.value > 0.0 and scale.std <= LARGEST_SIZE_STD * scale.value):
+        return False
+    return log.datum is not None or any(abs(scale.value / two - 1.0) < FACTOR_TWO_TOLERANCE for two in (0.5, 2.0))
+
+
+def radius_hint(log: RobotLog, config: Config, scale: float) -> str:
+    """Return a text on the wheel radius that the log shows; "check " where the wheel speeds need no radius."""
+    radius_m = config.robot.wheel_radius_m
+    by_radius = any(one.role == "wheels" and _ANGLES.search(one.why) for one in log.streams)
+    if radius_m is None or not by_radius:
+        return "check "
+    robot = f"{config.robot.name} has {radius_m:g} m" if config.robot.name else f"{radius_m:g} m is configured"
+    question = "is --robot right? check" if config.robot.name else "check"
+    return f"the log shows a wheel radius of {scale * radius_m:.3f} m, {robot}: {question} "
+
+
+_ANGLES = re.compile(r" in (rad|counts)")
+"""Words in the `why` of a stream whose speeds were computed with the configured wheel radius."""
 
 
 def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:

@@ -195,8 +195,8 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "second_publisher": Explanation(
         "warning",
-        "Messages of zeros come between others that state motion: two programs publish on one topic.",
-        "The messages of zeros are left out.",
+        "Messages that repeat one state, often zeros, come between others that state another motion: two publishers.",
+        "The messages that repeat themselves are left out.",
         "Stop the second publisher, or give it another topic.",
     ),
     "wheels_joined": Explanation(
@@ -282,6 +282,12 @@ OF_WHEELS: dict[str, Explanation] = {
         "The robot goes further or less far than the wheels report.",
         "Both sides are scaled by the estimate.",
         "None is needed. `wheels.left_scale` and `wheels.right_scale` set known scales.",
+    ),
+    "wheel_size_wrong": Explanation(
+        "warning",
+        "The robot goes another distance than the wheels report, by a constant factor beyond tyres and soil.",
+        "Both sides are scaled by the estimate: wheel radius, encoder resolution, gear or unit are wrong.",
+        "Correct `robot.wheel_radius_m`, `robot.encoder_counts_per_rev` or `wheels.unit`, or set `wheels.left_scale`.",
     ),
     "wheel_scale_differs": Explanation(
         "warning",

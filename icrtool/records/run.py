@@ -242,17 +242,12 @@ class Run:
     def radius_errors(self) -> tuple[float, float]:
         """Factors of `wheel_scales`, left and right, that correct a wrong radius or resolution, not tyres and soil.
 
-        Scales of tyres and soil are within `ROLLING_SCALE` of 1, and no error; else the configured scales, or the power
-        of two nearest to the estimated ones. Motion models are fitted to speeds with these factors, and estimate the
-        rest: their prior is of wheels that roll near their radius.
+        Scales of tyres and soil are within `ROLLING_SCALE` of 1, and no error. Motion models are fitted to speeds with
+        these factors, and estimate the rest: their prior is of wheels that roll near their radius.
         """
-        given = self.config.wheels
-        configured = given.left_scale != "auto" or given.right_scale != "auto"
         left, right = (
-            1.0 if not one or abs(abs(one) - 1.0) <= ROLLING_SCALE
-            else abs(one) if configured else 2.0 ** round(math.log2(abs(one)))
-            for one in self.wheel_scales
-        )  # fmt: skip
+            1.0 if not one or abs(abs(one) - 1.0) <= ROLLING_SCALE else abs(one) for one in self.wheel_scales
+        )
         return left, right
 
     @property

@@ -75,10 +75,13 @@ Columns = dict[Quantity, list[NDArray[Any]]]
 """Positions and speeds (n,) of each wheel; no column for a quantity that is not recorded."""
 
 FEWEST_REPEATED = 5
-"""Least number of messages of zeros between others from which a second publisher is found."""
+"""Least number of repeated messages between others from which a second publisher is found."""
 
 LITTLE_CHANGE = 0.5
-"""Largest difference of the messages before and after such zeros, as a share of their values."""
+"""Largest difference of the messages before and after such a message, as a share of their difference from it."""
+
+USUAL_STEPS = 0.98
+"""Quantile of the changes from message to message that a state other than zero must exceed to be another one's."""
 
 
 def _by_message(
@@ -92,35 +95,66 @@ def _by_message(
     if foreign is None:
         return columns, of_topic(table), ()
     kept = {quantity: [column[~foreign] for column in wheels] for quantity, wheels in columns.items()}
-    counted = (
-        f"{np.count_nonzero(foreign)} of {len(foreign)} messages state 0 for every wheel, between others that do not"
-    )
+    nothing = not np.any([np.nan_to_num(column[foreign]).any() for wheels in columns.values() for column in wheels])
+    state = "0 for every wheel" if nothing else "one and the same motion"
+    counted = f"{np.count_nonzero(foreign)} of {len(foreign)} messages state {state}, between others that do not"
     left_out = note("second_publisher", f"{counted}: sent by a second publisher, left out")
     return kept, of_topic(table.rows(~foreign)), (left_out,)
 
 
 def _of_second_publisher(positions: Sequence[NDArray[Any]], speeds: Sequence[NDArray[Any]]) -> Bools | None:
-    """Return which messages (n,) state 0 for every wheel between messages that state motion; None: none."""
+    """Return which messages (n,) repeat one state between messages that state another motion; None: none.
+
+    A second publisher sends zeros, or a state that it does not update. A robot that stands does not return to its
+    motion at once, and an encoder of few counts changes as little elsewhere.
+    """
     columns = [*positions, *speeds]
     if not columns or len(columns[0]) < FEWEST_REPEATED:
         return None
-    zero, known = np.ones(len(columns[0]), np.bool_), np.zeros(len(columns[0]), np.bool_)
-    for column in columns:
+    sums, zero, known = (
+        np.zeros(len(columns[0])),
+        np.ones(len(columns[0]), np.bool_),
+        np.zeros(len(columns[0]), np.bool_),
+    )
+    for column, weight in zip(columns, np.sqrt(np.arange(2.0, len(columns) + 2.0)), strict=True):
         finite = np.isfinite(column)
+        sums += weight * np.where(finite, column, 0.0)
         zero &= (column == 0.0) | ~finite
         known |= finite
-    zero &= known
-    moving = np.flatnonzero(~zero)
-    if not zero.any() or len(moving) < FEWEST_REPEATED:
-        return None
-    around = np.flatnonzero(np.diff(moving) > 1)
-    some = [column for column in positions if np.any(column[moving] != 0.0)] or list(speeds)
-    values = np.nan_to_num(np.column_stack(some)[moving], nan=0.0, posinf=0.0, neginf=0.0)
-    before, after = values[around], values[around + 1]
-    size = np.maximum(np.abs(before), np.abs(after)).max(axis=1)
-    between = np.abs(after - before).max(axis=1) < LITTLE_CHANGE * size
+    for repeated in (_most_repeated(sums), zero & known):
+        some = [column for column in positions if np.nan_to_num(column[~repeated]).any()] or list(speeds)
+        if _alternates(some, repeated):
+            return repeated
+    return None
+
+
+def _most_repeated(sums: NDArray[np.float64]) -> Bools:
+    """Return which messages (n,) have the weighted sum that the largest number of stretches of equal sums has."""
+    begins = np.append(True, sums[1:] != sums[:-1])
+    values, count = np.unique(sums[begins], return_counts=True)
+    return np.asarray(sums == values[int(np.argmax(count))])
+
+
+def _alternates(columns: Sequence[NDArray[Any]], repeated: Bools) -> bool:
+    """Return whether repeated messages (n,) lie between others that hardly differ, compared with the repeated state."""
+    others = np.flatnonzero(~repeated)
+    around = np.flatnonzero(np.diff(others) > 1)
+    if len(around) < FEWEST_REPEATED or not columns:
+        return False
+    first, size, change = int(np.argmax(repeated)), np.zeros(len(around)), np.zeros(len(around))
+    steps, moves = np.zeros(len(others) - 1), False
+    for column in columns:
+        values = np.nan_to_num(column[others], nan=0.0, posinf=0.0, neginf=0.0)
+        state = float(np.nan_to_num(column[first]))
+        before, after = values[around], values[around + 1]
+        size = np.maximum(size, np.maximum(np.abs(before - state), np.abs(after - state)))
+        change = np.maximum(change, np.abs(after - before))
+        steps, moves = np.maximum(steps, np.abs(np.diff(values))), moves or state != 0.0
+    between = change < LITTLE_CHANGE * size
     count = int(np.count_nonzero(between))
-    return zero if count >= FEWEST_REPEATED and 2 * count > len(around) else None
+    if not (count >= FEWEST_REPEATED and 2 * count > len(around)):
+        return False
+    return not moves or float(np.median(size[between])) > float(np.quantile(steps, USUAL_STEPS))
 
 
 def _by_own_messages(

@@ -12,6 +12,7 @@ from icrtool.alignment.clock_search import take_shifts
 from icrtool.config import load_config
 from icrtool.pipeline import fit
 from icrtool.records.run import Run
+from icrtool.records.samples import GyroAxes, GyroSamples
 from icrtool.records.tables import RobotLog
 from support.drives import ICRS, make_log
 
@@ -51,6 +52,39 @@ def test_headings_of_another_clock_are_moved_back(streams: tuple[str, ...]) -> N
     run = fit(later(make_log(seconds=120.0), **dict.fromkeys(streams, 18.0)), load_config(sets=SETS))
     check(run)
     assert run.document.alignment["heading_delay_s"].applied == pytest.approx(18.0, abs=0.1)
+
+
+def with_gyro(log: RobotLog, topic: str) -> RobotLog:
+    """Return a log with the turn rates of an inertial unit, at the stamps of its headings."""
+    stamps, turned = log.heading.stamp_ns, np.unwrap(log.heading.heading_rad)
+    # a second of headings hides their noise
+    t = (stamps - stamps[0]) / 1e9
+    rate = np.interp(t + 0.5, t, turned) - np.interp(t - 0.5, t, turned)
+    axes = GyroAxes(topic, stamps, np.column_stack([0.0 * rate, 0.0 * rate, -rate]))
+    return replace(log, gyros=(axes,), gyro=GyroSamples(topic, stamps, rate))
+
+
+@pytest.mark.parametrize("same_message", [True, False])
+def test_turn_rates_of_another_clock_are_moved_back(same_message: bool) -> None:
+    plain = make_log(seconds=120.0)
+    sent = later(plain, heading=18.0)
+    topic = sent.topic("heading") if same_message else "/imu/gyro"
+    log = with_gyro(sent, topic)
+    moved, _, shifts = take_shifts(log, load_config(sets=SETS))
+    # the alignment finds the rest of it
+    assert shifts.heading == pytest.approx(18.0, abs=0.2)
+    assert moved.gyro is not None
+    for gyro in (moved.gyro, *moved.gyros):
+        off = (gyro.stamp_ns - plain.heading.stamp_ns) / 1e9
+        assert np.abs(off).max() < 0.3
+    assert sum("turn rates of the gyro" in one.text for one in shifts.notes) == (not same_message)
+
+
+def test_turn_rates_of_one_clock_with_the_wheels_stay_where_they_are() -> None:
+    log = with_gyro(make_log(seconds=120.0), "/imu/gyro")
+    moved, _, shifts = take_shifts(log, load_config(sets=SETS))
+    assert moved is log
+    assert not shifts.notes
 
 
 @pytest.mark.parametrize("shift_s", [18.0, -45.0])

@@ -35,14 +35,20 @@ def fitted(path: Path, *sets: str) -> Run:
     [
         (2.0, ()),
         (0.5, ()),
+        (3.0, ()),
+        (0.1, ()),
+        (10.0, ()),
+        (1.3, ()),
         (2.0, ("wheels.left_scale=0.5", "wheels.right_scale=0.5")),
         (0.3, ("wheels.left_scale=3.3333", "wheels.right_scale=3.3333")),
     ],
-    ids=["twice", "half", "configured half", "configured third"],
+    ids=["twice", "half", "three times", "a tenth", "ten times", "1.3 times", "configured half", "configured third"],
 )
 def test_every_row_sees_wheels_that_were_corrected(path: Path, radius: float, sets: tuple[str, ...]) -> None:
     run = fitted(path, f"robot.wheel_radius_m={radius * RADIUS_M}", *sets)
     assert run.usable
+    assert ("wheel_size_wrong" in [one.code for one in run.document.notes]) is not bool(sets)
+    assert run.document.alignment["wheel_scale"].applied == pytest.approx(1.0 if sets else 1 / radius, rel=0.01)
     numbers = run.document.controller
     assert numbers is not None
     assert numbers.multiplier == pytest.approx(MULTIPLIER, abs=0.02)

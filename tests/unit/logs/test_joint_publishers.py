@@ -10,6 +10,7 @@ import pytest
 
 import icrtool
 from icrtool.config import load_config
+from icrtool.kernels.arrays import Floats
 from icrtool.logs.read_log import read_log
 from support.field_logs import (
     ROBOT,
@@ -68,6 +69,51 @@ def test_zeros_of_a_second_publisher_are_left_out_and_named(
     assert len(rows) > 0.98 * len(DRIVE.stamp_ns)
     np.testing.assert_allclose(log.wheels.left[:-1], DRIVE.left_radps[rows], rtol=1e-6)
     assert any("second publisher" in one for one in log.warnings)
+
+
+@pytest.mark.parametrize("every_ns", [20_000_000, 70_000_000])
+@pytest.mark.parametrize("quantity", ["pv", "p", "v"])
+@pytest.mark.parametrize("stale", [True, False])
+def test_a_state_that_a_second_publisher_repeats_is_left_out(
+    tmp_path: Path, every_ns: int, quantity: str, stale: bool
+) -> None:
+    at = int(np.argmax(np.abs(DRIVE.left_radps))) if stale else 0
+    place, speed = (DRIVE.left[at], DRIVE.right[at]), (DRIVE.left_radps[at], DRIVE.right_radps[at])
+    state, none = {"p": np.array(place), "v": np.array(speed)}, np.zeros(0)
+
+    def sent(stamp_ns: int, values: dict[str, Floats]) -> Message:
+        position, velocity = (values[one] if one in quantity else none for one in "pv")
+        names = ["left_wheel", "right_wheel"]
+        message = made(KIND, header=header(stamp_ns), name=names, position=position, velocity=velocity)
+        return Message(stamp_ns, "/joint_states", KIND, message)
+
+    repeated = state if stale else {one: np.zeros(2) for one in "pv"}
+    begin, end = int(DRIVE.stamp_ns[0]), int(DRIVE.stamp_ns[-1])
+    others = [sent(stamp_ns + 3_000_000, repeated) for stamp_ns in range(begin, end, every_ns)]
+    own = [
+        sent(stamp_ns, {"p": np.array([a, b]), "v": np.array([c, d])})
+        for stamp_ns, a, b, c, d in zip(
+            DRIVE.stamp_ns.tolist(), DRIVE.left, DRIVE.right, DRIVE.left_radps, DRIVE.right_radps, strict=True
+        )
+    ]
+    path = write_messages(tmp_path / "log.mcap", own, others, fixes(DRIVE), imus(DRIVE))
+    log = read_log(path, load_config(sets=ROBOT))
+    rows = np.searchsorted(DRIVE.stamp_ns, log.wheels.stamp_ns[:-1])
+    assert len(rows) > 0.97 * len(DRIVE.stamp_ns)
+    expected = DRIVE.left_radps[rows]
+    np.testing.assert_allclose(log.wheels.left[:-1], expected, rtol=1e-6, atol=0.0 if "p" not in quantity else 0.05)
+    assert [one.code for one in log.notes].count("second_publisher") == 1
+
+
+def test_speeds_of_an_encoder_with_few_counts_have_no_second_publisher(tmp_path: Path) -> None:
+    """Speeds in steps, that go to and fro between two values."""
+    sides = (np.round(side / 0.5) * 0.5 for side in (DRIVE.left_radps, DRIVE.right_radps))
+    left, right = (side + 0.5 * (np.arange(len(side)) % 3 == 0) for side in sides)
+    drive = DRIVE._replace(left_radps=left, right_radps=right)
+    path = write_messages(tmp_path / "log.mcap", joint_states(drive), fixes(DRIVE), imus(DRIVE))
+    log = read_log(path, load_config(sets=(*ROBOT, "wheels.quantity=velocity")))
+    assert len(log.wheels.stamp_ns) == len(DRIVE.stamp_ns)
+    assert not log.warnings
 
 
 def test_a_robot_that_stops_often_has_no_second_publisher(tmp_path: Path) -> None:
