@@ -144,8 +144,9 @@ def controller_error_text(errors: ControllerErrors | None) -> str:
 
 
 def turn_text(degrees: float) -> str:
-    """Return a turn as ``62° right``."""
-    return f"{abs(degrees):.0f}° {'right' if degrees >= 0 else 'left'}"
+    """Return a turn as ``62° right``, and ``0°`` for what rounds to it."""
+    size = f"{abs(degrees):.0f}°"
+    return size if size == "0°" else f"{size} {'right' if degrees >= 0 else 'left'}"
 
 
 def error_text(metres: float | None) -> str:

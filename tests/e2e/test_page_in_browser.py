@@ -72,6 +72,14 @@ def file(run: Run, report: DropoutReport, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.fixture(scope="module")
+def local_file(run: Run, report: DropoutReport, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of the same run, its position in a frame without datum."""
+    file = tmp_path_factory.mktemp("local") / "report.html"
+    file.write_text(run_page(with_summary(run, gnss={"datum": None}), report.document, {}), encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
 def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     with browser(tmp_path_factory.mktemp("profile")) as opened:
         yield opened
@@ -355,6 +363,31 @@ def test_the_chart_of_errors_draws_the_main_models_and_folds_the_others(chrome: 
     page.evaluate("document.querySelector('#error-others input').click()")
     assert page.evaluate(names.format("error-others")) == folded[:1]
     assert page.complaints() == []
+
+
+def test_one_row_has_its_interval_as_a_band_and_pointing_at_a_name_gives_another_its_own(
+    chrome: Browser, file: Path, report: DropoutReport
+) -> None:
+    page = chrome.page()
+    page.open(file)
+    page.evaluate("window.made = icrtoolCharts.errorChart(icrtoolPage.data); null")
+    assert report.document.best is not None
+    assert page.evaluate("made.bands()") == [report.document.best.model]
+    item = "[...document.querySelectorAll('#error-keys li')].find((one) => one.textContent.trim() === 'no_slip')"
+    page.evaluate(f"{item}.dispatchEvent(new Event('pointerover', {{bubbles: true}}))")
+    assert page.evaluate("made.bands()") == ["no_slip"]
+    page.evaluate("window.compared = icrtoolCharts.errorChart({...icrtoolPage.data,"
+                  " errors: {...icrtoolPage.data.errors, banded: undefined}}); null")  # fmt: skip
+    assert len(page.evaluate("compared.bands()")) > 2
+    assert page.complaints() == []
+
+
+def test_the_map_of_a_local_frame_has_no_north(chrome: Browser, local_file: Path, file: Path) -> None:
+    texts = "[...document.querySelectorAll('#map .name')].map((one) => one.textContent)"
+    for path, names in ((file, ["east [m]", "north [m]"]), (local_file, ["x [m]", "y [m]"])):
+        page = chrome.page()
+        page.open(path)
+        assert sorted(page.evaluate(texts)) == names
 
 
 @pytest.mark.parametrize("scale", [0.0, 3.7e-4, 0.0954, 0.3, 1.0, 13.0, 950.0])

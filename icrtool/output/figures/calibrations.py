@@ -177,6 +177,9 @@ MOST_DIFFERENCES = 24
 FOREST_ROW_IN, FOREST_GAP_IN = 0.25, 1.0
 """Height of a row of a forest plot, and of the space between two plots [in]."""
 
+LEAST_LABELS_IN, CHARACTER_IN = 2.0, 0.076
+"""Smallest width of the labels left of a forest plot, and usual width of one of their characters [in]."""
+
 SURE_LOOK: style.Look = {"marker": "o", "markersize": 5.0, "color": style.ICR["color"], "linestyle": "none",
                          "elinewidth": 1.8, "capsize": 2.5}  # fmt: skip
 CHANCE_LOOK: style.Look = SURE_LOOK | {"markerfacecolor": "white", "color": "0.35", "elinewidth": 1.2}
@@ -201,10 +204,12 @@ def transfer(found: GroupComparison, *, ax: Axes | None = None) -> Figure | Axes
     """
     errors, rows = _errors_of_groups(found), _differences(found)
     names = " · ".join(found.groups)
+    longest = max((len(one.words) for one in (*errors, *rows)), default=0)
+    left_in = max(LEAST_LABELS_IN, 0.3 + CHARACTER_IN * longest)
     heights = [max(len(part), 2) for part in (errors, rows)]
     panels_in = FOREST_ROW_IN * sum(heights)
     height_in, hspace = panels_in + FOREST_GAP_IN + 1.85, FOREST_GAP_IN / (panels_in / 2)
-    layout: style.Look = {"height_in": height_in, "margins_in": (2.5, 0.25, 0.85, 1.0), "hspace": hspace}
+    layout: style.Look = {"height_in": height_in, "margins_in": (left_in, 0.25, 0.85, 1.0), "hspace": hspace}
     sheet = new_sheet(
         _comparison_title(found), f"{names}: 95 % errors by wheels alone, with 95 % intervals", ax, **layout
     )
@@ -245,8 +250,10 @@ def _errors_of_groups(found: GroupComparison) -> list[Difference]:
     cells.sort(key=lambda one: (list(found.groups).index(one.tested_on), one.calibrated_on != one.tested_on))
     rows = []
     for one in cells:
-        by = "own calibration" if one.calibrated_on == one.tested_on else f"{_group(one.calibrated_on)}'s"
-        rows.append(Difference(f"{_group(one.tested_on)}, {by}", one.p95_m or 0.0, one.p95_low_m, one.p95_high_m))
+        by = "own" if one.calibrated_on == one.tested_on else f"by {_group(one.calibrated_on)}'s"
+        rows.append(
+            Difference(f"{_group(one.tested_on)}, {by} calibration", one.p95_m or 0.0, one.p95_low_m, one.p95_high_m)
+        )
     return rows
 
 
@@ -257,7 +264,7 @@ def _differences(found: GroupComparison) -> list[Difference]:
         for pair in found.pairs for one in pair.errors
     ]  # fmt: skip
     rows += [
-        (one, f"{_group(one.tested_on)}, {_group(one.calibrated_on)}'s − own, {one.horizon_m:g} m")
+        (one, f"{_group(one.tested_on)}, by {_group(one.calibrated_on)}'s − own, {one.horizon_m:g} m")
         for one in found.costs
     ]
     if len(rows) > MOST_DIFFERENCES:

@@ -177,8 +177,7 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
         The report holds none; `icrtool.dropout_report` makes one that does.
     """
     outages = _needed(report, report.outages, "outages")
-    norths = np.concatenate([report.reference_north_m, *(one.north_m for one in outages)])
-    easts = np.concatenate([report.reference_east_m, *(one.east_m for one in outages)])
+    norths, easts, whole = _view_of_outages(report, outages)
     width_in = style.WIDTH_IN - 0.95
     box_in = fitted_box_in(norths, easts, width_in)
     parts = []
@@ -191,7 +190,8 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
             parts.append(f"{len(ours)} {kind} of {span}, up to {error_text(worst)}")
     largest = max(one.document.end_error_m or 0.0 for one in outages)
     title = f"Without {fix_word(report.run_document)} the robot ends up to {error_text(largest)} off"
-    subtitle = f"{run_title(report.run_document)}: {'; '.join(parts)}"
+    part = "" if whole else "; a part of the path"
+    subtitle = f"{run_title(report.run_document)}: {'; '.join(parts)}{part}"
     sheet = new_sheet(title, subtitle, ax, height_in=box_in + 1.65)
     axes = sheet.subplots()[0, 0]
     cell = look_down(axes, norths, easts, ticks=9)
@@ -214,6 +214,27 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     name_directions(axes, report.run_document)
     sheet.legend()
     return sheet.finished()
+
+
+LEAST_VIEW = 0.25
+"""Smallest size of the view of outages, as a share of the path's size: a small outage would be a dot on it."""
+
+MOST_VIEW = 0.7
+"""Largest size of a view of a part of the path, as a share of the path's size; else the whole path is shown."""
+
+
+def _view_of_outages(report: DropoutReport, outages: Sequence[Outage]) -> tuple[Floats, Floats, bool]:
+    """Return north and east (n,) [m] of what the view of outages holds, and whether that is the whole path."""
+    paths = report.reference_north_m, report.reference_east_m
+    lost = [np.concatenate([getattr(one, name) for one in outages]) for name in ("north_m", "east_m")]
+    span_m = max(float(np.ptp(path)) for path in paths)
+    sizes_m = [max(1.6 * float(np.ptp(column)), LEAST_VIEW * span_m) for column in lost]
+    if max(sizes_m) > MOST_VIEW * span_m:
+        norths, easts = (np.concatenate(both) for both in zip(paths, lost, strict=True))
+        return norths, easts, True
+    middles = [(float(column.min()) + float(column.max())) / 2 for column in lost]
+    norths, easts = (middle + size_m * np.array([-0.5, 0.5]) for middle, size_m in zip(middles, sizes_m, strict=True))
+    return norths, easts, False
 
 
 ERROR_MAP = "viridis_r"

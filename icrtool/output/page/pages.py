@@ -45,6 +45,7 @@ from icrtool.output.tables.run import advice, streams_section, unusable_line
 from icrtool.output.text_blocks import PAGE, Block, Cell, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import (
     GLOSSARY,
+    direction_words,
     driven_text,
     duration_text,
     error_text,
@@ -139,7 +140,8 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     return render(
         SCRIPTS, drive_data(compared, report, coordinates=coordinates), title=summary.log,
         kind="Drive without GNSS: report of one log", blocks=blocks, pictures=pictures,
-        duration_s=summary.drive.duration_s, groups=(), folded_models=len(rows) - len(shown_rows(list(rows))),
+        duration_s=summary.drive.duration_s, directions=[word.lower() for word in direction_words(summary)], groups=(),
+        folded_models=len(rows) - len(shown_rows(list(rows))),
         sketch=drive_sketch(run, stated),
     )  # fmt: skip
 

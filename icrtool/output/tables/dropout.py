@@ -34,6 +34,7 @@ from icrtool.output.text_blocks import (
 )
 from icrtool.output.text_format import (
     controller_error_text,
+    direction_words,
     duration_text,
     error_text,
     plus_minus,
@@ -268,7 +269,8 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
         )
         for rank, one in enumerate(report.worst, start=1)
     ]  # fmt: skip
-    head = ("", "from", "error", "no_slip", "turn", "mean speed", "north", "east", "meanwhile")
+    across, up = (word.lower() for word in direction_words(summary))
+    head = ("", "from", "error", "no_slip", "turn", "mean speed", up, across, "meanwhile")
     caption = (
         f"Trials of {first.horizon_m:g} m with the largest error of {first.model} that do not "
         "overlap. What they share (a speed, a turn, a place) is where the model fails"

@@ -121,6 +121,21 @@ def test_the_summary_draws_the_numbers_of_both_models(report: DropoutReport, out
     assert high > float(np.nanmax(report.results[1].column("p95_m")))
 
 
+def test_a_small_outage_is_shown_on_a_part_of_the_path(report: DropoutReport, outages: tuple[Outage, ...]) -> None:
+    path = report.reference_north_m, report.reference_east_m
+    span_m = max(float(np.ptp(one)) for one in path)
+    one = outages[0]
+    assert max(float(np.ptp(one.north_m)), float(np.ptp(one.east_m))) < 0.3 * span_m
+    for shown, small in (((one,), True), (outages, False)):
+        figure = drawn(lambda shown=shown: dropout_outages(replace(report, outages=shown)))
+        (axes,) = figure.axes
+        view_m = [float(np.ptp(limits)) for limits in (axes.get_ylim(), axes.get_xlim())]
+        for column, (low, high) in ((one.north_m, axes.get_ylim()), (one.east_m, axes.get_xlim())):
+            assert low < float(column.min()) < float(column.max()) < high
+        assert ("a part of the path" in figure.texts[1].get_text()) is small
+        assert (max(view_m) < 0.9 * span_m) is small
+
+
 def named(one: ModelResult, name: str, factor: float) -> ModelResult:
     keys = (
         "expected_error_m",

@@ -279,7 +279,7 @@ def test_the_picture_of_a_comparison_shows_errors_and_differences_with_their_int
     own, more = figure.axes
     assert [text.get_text() for text in own.get_yticklabels()][:2] == [
         "grass, own calibration",
-        "grass, a ver… group's",
+        "grass, by a ver… group's calibration",
     ]
     drawn_at = {text.get_text(): row for row, text in enumerate(more.get_yticklabels())}
     assert len(drawn_at) == len(differences) + 6

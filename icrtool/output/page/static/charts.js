@@ -275,6 +275,8 @@ const icrtoolCharts = (() => {
     if (!element || !horizons.length) return () => {};
     let chart = null;
     const folded = models.filter((model) => !model.shown), hidden = new Set(folded.map((model) => model.name));
+    // Bands of all rows would cover one another: one row has its band, the row whose name is pointed at; else all have.
+    let banded = data.errors.banded || "";
 
     function draw() {
       const measure = document.querySelector("input[name=measure]:checked").value, log = document.getElementById("log").checked;
@@ -286,7 +288,7 @@ const icrtoolCharts = (() => {
         columns.push(known(model[`${measure}_high`]), known(model[measure]), known(model[`${measure}_low`]));
         const edge = { stroke: "transparent", width: 0, points: { show: false }, show };
         series.push(edge, { ...line(model), show, points: { show: true, size: 5, fill: color(model.color) } }, { ...edge });
-        if (show) bands.push({ series: [first, first + 2], fill: faint(model.color, 0.16) });
+        if (show && (!banded || model.name === banded)) bands.push({ series: [first, first + 2], fill: faint(model.color, 0.2) });
       }
       if (reference[measure].length) {
         columns.push(known(reference[measure]));
@@ -317,11 +319,21 @@ const icrtoolCharts = (() => {
     const change = (one, shown) => { hidden[shown ? "delete" : "add"](one.name); draw(); };
     keys(document.getElementById("error-keys"), entries, isShown, change);
     if (folded.length) keys(document.getElementById("error-others"), folded, isShown, change);
+    const point = (event) => {
+      const item = event.target.closest("li"), list = item && item.parentElement;
+      const one = item && (list.id === "error-others" ? folded : entries)[[...list.children].indexOf(item)];
+      if (!banded || !one || !one.name || one.name === banded || hidden.has(one.name)) return;
+      banded = one.name;
+      draw();
+    };
+    for (const list of document.querySelectorAll("#error-keys, #error-others")) for (const kind of ["pointerover", "focusin"]) list.addEventListener(kind, point);
     const inputs = [...document.querySelectorAll("input[name=measure], #log")];
     for (const input of inputs) input.addEventListener("change", draw);
     draw();
     return {
       resize: () => chart.setSize({ width: element.clientWidth, height: 320 }),
+      /** The rows that have a band: for tests. */
+      bands: () => chart.bands.map((one) => models[(one.series[0] - 1) / 3].name),
       destroy() {
         for (const input of inputs) input.removeEventListener("change", draw);
         chart.destroy();

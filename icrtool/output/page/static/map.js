@@ -108,8 +108,8 @@ const icrtoolMap = (() => {
       const text = (shift) => (value) => number(+(value + shift).toFixed(3));
       xAxis.attr("transform", `translate(0,${height - MARGIN.bottom})`).call(d3.axisBottom(xr).tickValues(xTicks).tickFormat(text(e0)).tickSizeOuter(0));
       yAxis.attr("transform", `translate(${MARGIN.left},0)`).call(d3.axisLeft(yr).tickValues(yTicks).tickFormat(text(n0)).tickSizeOuter(0));
-      xAxis.selectAll(".name").data([0]).join("text").attr("class", "name").attr("x", width - MARGIN.right).attr("y", -6).attr("text-anchor", "end").text("east [m]");
-      yAxis.selectAll(".name").data([0]).join("text").attr("class", "name").attr("x", 6).attr("y", MARGIN.top + 10).attr("text-anchor", "start").text("north [m]");
+      xAxis.selectAll(".name").data([0]).join("text").attr("class", "name").attr("x", width - MARGIN.right).attr("y", -6).attr("text-anchor", "end").text(`${element.dataset.across} [m]`);
+      yAxis.selectAll(".name").data([0]).join("text").attr("class", "name").attr("x", 6).attr("y", MARGIN.top + 10).attr("text-anchor", "start").text(`${element.dataset.up} [m]`);
       grid.selectAll("line").data([...xTicks.map((v) => [xr(v), MARGIN.top, xr(v), height - MARGIN.bottom]), ...yTicks.map((v) => [MARGIN.left, yr(v), width - MARGIN.right, yr(v)])])
         .join("line").attr("x1", (d) => d[0]).attr("y1", (d) => d[1]).attr("x2", (d) => d[2]).attr("y2", (d) => d[3]);
     }
