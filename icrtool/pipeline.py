@@ -18,15 +18,13 @@ from icrtool.config import Config
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import FitRequest, ReportRequest, ResultFiles
 from icrtool.records.run import Run, WarmStart, check_type
+from icrtool.records.stages import Watch, unwatched
 from icrtool.records.tables import RobotLog
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
     from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
     from icrtool.dropout_analysis.trials import ErrorSink
-
-Stage = Callable[[str], None]
-"""Called with the name of each stage when it begins."""
 
 
 def fit(
@@ -36,7 +34,7 @@ def fit(
     changes_s: tuple[float, ...] = (),
     smooth: bool = False,
     warm_start: WarmStart | None = None,
-    watch: Stage | None = None,
+    watch: Watch = unwatched,
 ) -> Run:
     """Learn a robot's track ICRs from a log, and its motion model.
 
@@ -75,7 +73,7 @@ def fit_log(
     request: FitRequest,
     *,
     warm_start: WarmStart | None = None,
-    watch: Stage | None = None,
+    watch: Watch = unwatched,
 ) -> Run:
     """Return the run of a log, with its motion model.
 
@@ -92,20 +90,19 @@ def fit_log(
     from icrtool.calibration.run_models import with_motion
     from icrtool.estimation.fit import fit_filter
 
-    held = [log]
+    watch, held = _giving_back(watch), [log]
     del log
-    run = fit_filter(held.pop(), config, request, warm_start=warm_start, watch=_giving_back(watch))
-    give_back_freed()
+    run = fit_filter(held.pop(), config, request, warm_start=warm_start, watch=watch)
+    watch("motion model")
     return replace(run, document=with_motion(run))
 
 
-def _giving_back(watch: Stage | None) -> Stage:
+def _giving_back(watch: Watch) -> Watch:
     """Return what gives back freed memory at the begin of each stage, and then calls `watch`."""
 
     def begin(stage: str) -> None:
         give_back_freed()
-        if watch is not None:
-            watch(stage)
+        watch(stage)
 
     return begin
 
@@ -117,7 +114,7 @@ def fit_into(
     config: Config,
     request: FitRequest,
     files: ResultFiles,
-    begin: Stage,
+    watch: Watch,
     *,
     warm_start: Path | None = None,
     share: Callable[[float], None] | None = None,
@@ -137,22 +134,23 @@ def fit_into(
     from icrtool.output.files.remote_place import on_disk
     from icrtool.output.run_directory import check_target, new_run, replaced_log
 
-    start, stage = _warm_start(warm_start, config, note), _giving_back(begin)
-    with on_disk(directory, begin=begin) as place:
+    start, watch = _warm_start(warm_start, config, note), _giving_back(watch)
+    with on_disk(directory, begin=watch) as place:
         inside = inside if place is directory else None
         check_target(place, log, overwrite=files.overwrite, inside=inside)
-        stage("reading")
+        watch("reading")
         # No name here holds the log: its columns are freed where they are needed no longer.
         run = fit_log(
             read_log(log, config, share, start=request.start, end=request.end), config, request,
-            warm_start=start, watch=begin,
+            warm_start=start, watch=watch,
         )  # fmt: skip
         if note is not None and (before := replaced_log(place, run)) is not None:
             note(f"{directory}: replaced the run of another recording ({before})")
-        stage("writing, pictures" if files.plots else "writing")
+        watch("writing")
         with new_run(
-            run, place, states=files.states, plots=files.plots, figures=files.figures, note=note, inside=inside
-        ) as partial:
+            run, place, states=files.states, plots=files.plots, figures=files.figures, note=note, watch=watch,
+            inside=inside,
+        ) as partial:  # fmt: skip
             yield run, partial
 
 
@@ -176,7 +174,7 @@ def report_into(
     run: Run,
     request: ReportRequest,
     files: ResultFiles,
-    begin: Stage,
+    watch: Watch,
     *,
     log: Path | None = None,
     calibrations: Sequence[Calibration] = (),
@@ -194,22 +192,21 @@ def report_into(
     from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, write_report
     from icrtool.output.run_directory import PAGE_FILE
 
-    stage = _giving_back(begin)
+    watch = _giving_back(watch)
 
     def analysed(sink: ErrorSink | None) -> DropoutReport:
-        stage("dropout analysis")
-        report = report_on(run, request, log=log, calibrations=calibrations, baseline=baseline, sink=sink)
-        stage("dropout report, pictures" if files.plots else "dropout report")
+        report = report_on(run, request, log=log, calibrations=calibrations, baseline=baseline, sink=sink, watch=watch)
+        watch("dropout report")
         return report
 
     stamps = run.table.stamp_ns if files.trials else None
     report = write_report(
         analysed, directory / DROPOUT_DIRECTORY, plots=files.plots, figures=files.figures, stamp_ns=stamps,
-        inside=directory,
+        watch=watch, inside=directory,
     )  # fmt: skip
     if files.page:
         from icrtool.output.page.pages import write_page
 
-        stage("page")
+        watch("page")
         write_page(run, report, directory / PAGE_FILE, plots=directory, inside=directory)
     return report

@@ -42,7 +42,6 @@ from icrtool.motion.window_fit import Fold, Pool, own_constants
 from icrtool.records import calibration_document as documents
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.notes import Note, note
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
 from icrtool.records.run_document import RecommendedDocument
 from icrtool.records.samples import are_twist
@@ -119,7 +118,6 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | 
         return rates
 
     line = _gyro_line(plain, rate(0.0))
-    give_back_freed()
     if not line.is_yaw:
         return plain
     later_s = line.lead_s if delay_s == "auto" else delay_s

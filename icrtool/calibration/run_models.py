@@ -30,7 +30,6 @@ from icrtool.motion.models import FIVE, ICR_VALUES, NO_SLIP, RECOMMENDED, TrackG
 from icrtool.motion.recording import ErrorsOf, PastLines, Recording, TrialErrors, Trials, past_gyro_lines
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.notes import Note, note
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.rows import INSTALLATION, PAST, row_of
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, vendor_icrs, width_or_usual_m
 from icrtool.records.run_document import GeometryDocument, RunDocument
@@ -223,7 +222,6 @@ def compare_models(
         why = f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it"
         notes.append(note("lever_unknown", why))
     found = hold_out([recording])
-    give_back_freed()
     driven = recording if past is None else with_poses_of(recording, past)
     rows = [
         row for row in _rows(run, found, heading, driven) if run.track_width_m is not None or NO_SLIP not in row.name
@@ -340,7 +338,6 @@ def _errors_turned(
     track, (first_rows, scales, biases) = recording.track, lines()
     gyro = track.gyro if track.gyro is not None else np.zeros(len(track.t))
     turned, lasted = track.cumulate(gyro), track.cumulate(np.ones(len(track.t)))
-    give_back_freed()
     errors = TrialErrors.none(trials.ends.shape)
     of_line = np.searchsorted(trials.starts, np.append(first_rows, len(track.t)))
     for line, (scale, bias) in enumerate(zip(scales.tolist(), biases.tolist(), strict=True)):

@@ -95,7 +95,7 @@ def batch_command(
     compared = options.baseline_of(batch.baseline, asked.gates)
     options.calibrations_of(batch.calibrations, asked)
     with remote_place.on_disk(output, parts=fleet_files.FOLDERS) as folder:
-        requests = batches.plan(places, output, batch, folder)
+        requests = batches.plan_requests(places, output, batch, folder)
         folder.mkdir(parents=True, exist_ok=True)
         view = View(len(requests), printer)
         rows = run_all(requests, workers, batch, view, folder)

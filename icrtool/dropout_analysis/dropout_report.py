@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -42,10 +43,10 @@ from icrtool.records.choices import Reference, Starts
 from icrtool.records.dropout_document import TurningSplit, UsedCalibration
 from icrtool.records.notes import Note, warnings_of
 from icrtool.records.plain_data import plain
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import ReportRequest
 from icrtool.records.rows import TOPIC_ROW, kind_of, turned_by
 from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
+from icrtool.records.stages import Watch, unwatched
 from icrtool.records.text import distance_text
 from icrtool.records.topic_poses import TopicPoses
 
@@ -192,79 +193,55 @@ def report_on(
     calibrations: Sequence[Calibration] = (),
     baseline: report.BaselineReport | None = None,
     sink: ErrorSink | None = None,
+    watch: Watch = unwatched,
 ) -> report.DropoutReport:
     """Return the dropout report of a request.
 
     `dropout_report` makes the request of its keyword arguments; the other parameters and the errors are the same.
+    `watch` is called with the name of each stage when it begins.
     """
     check_type(run, Run, MAKE_RUN)
-    if request.with_jumps:
-        run = replace(run, sensors=replace(run.sensors, jumps=()))
-    whole = run
-    if request.without_events:
-        # Each slip event becomes a gap: no trial, window or forced outage crosses a gap.
-        run = replace(run, in_gap=run.in_gap | run.slipping)
+    watch("outages and examples")
     limits = [report.parse_gate(gate) for gate in request.gates]
-    lengths_s = forced_lengths_s(run, request)
-    if request.outage_at_s and not lengths_s:
-        raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
-    plans = [shown_paths.plan_outages(run, length, request.outage_at_s) for length in lengths_s]
+    runs = _Runs.of(run, request)
+    plans = _outage_plans(runs.filtered, request)
     scored = _scored_topics(request, log)
-    forced = [outage for plan in plans for outage in shown_paths.force_outages(run, plan)]
-    compared = with_smoothed_reference(run) if request.reference == "smoothed" else run
+    forced = [outage for plan in plans for outage in shown_paths.force_outages(runs.filtered, plan)]
+    compared = runs.compared
     unusable = "" if run.usable or request.allow_unusable else str(run.document.unusable_because)
     # Both are computed and released before the models are compared, which needs columns of the same size.
     examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, request.starts)
-    give_back_freed()
-    used, further, of_sensors = _calibration_rows(compared, run, () if unusable else calibrations, request)
-    of_topics, topic_notes = topic_rows(compared, track_of(compared), scored) if scored and not unusable else ([], [])
-    found, why = None, unusable
-    if request.ladder and not unusable:
-        try:
-            found = compare_models(
-                compared, measured_headings(run), calibrations, run, refit_sensors=request.refit_sensors
-            )
-        except DataError as err:
-            why = f"{err.why}, {err.advice}"
-    give_back_freed()
-    horizons = list(request.horizons_m if request.horizons_m is not None else run.config.dropout.horizons_m)
-    for at_m in (gate.horizon_m for gate in limits):
-        if at_m is not None and not any(math.isclose(at_m, horizon, rel_tol=1e-9) for horizon in horizons):
-            horizons.append(at_m)
-    rows = () if found is None else found.rows
-    track, sparse = (None, None) if found is None else (found.track, found.table.trials[0].starts)
+    rows = _TestedRows((), (), (), (), None, unusable)
+    if not unusable:
+        rows = _tested_rows(runs, calibrations, scored, request, watch)
+    found, horizons_m = rows.found, _horizons_of(run, request, limits)
     errors = measure_errors(
-        compared, horizons, further=[*rows, *further, *of_topics], starts=request.starts, seed=request.seed, sink=sink,
-        starts_of_further=sparse, track=track,
+        compared, horizons_m, further=rows.all, starts=request.starts, seed=request.seed, sink=sink,
+        starts_of_further=None if found is None else found.table.trials[0].starts,
+        track=None if found is None else found.track, watch=watch,
     )  # fmt: skip
-    give_back_freed()
-    if found is not None and (against := why_unusable(run.document, errors, [row.name for row in rows])):
-        # The errors stay in the report: they show the contradiction.
-        document = msgspec.structs.replace(
-            run.document, usable=False, unusable_because=against.text, recommended=None,
-            notes=(*run.document.notes, against),
-        )  # fmt: skip
-        compared, errors = replace(compared, document=document), replace(errors, run_document=document)
+    watch("budgets and limits")
+    if found is not None and (against := why_unusable(run.document, errors, [row.name for row in found.rows])):
+        compared, errors = _contradicted(compared, errors, against)
         found, unusable = found._replace(calibration=None), "" if request.allow_unusable else against.text
     cost = None
     if request.without_events:
-        crossed = replace(compared, in_gap=whole.in_gap)
-        cost = measure_errors(crossed, horizons, starts=request.starts, seed=request.seed)
-    budgets_m = () if unusable else request.budgets_m
+        crossed = replace(compared, in_gap=runs.with_events.in_gap)
+        cost = measure_errors(crossed, horizons_m, starts=request.starts, seed=request.seed)
     by_start = shown_paths.errors_by_start(compared, found, starts=request.starts)
+    budgets_m = () if unusable else request.budgets_m
+    budgets = [one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)]
     return _report(
         compared, errors, request,
         with_events=cost,
         found=found,
-        left_out=why,
-        calibrations=used,
+        left_out=rows.left_out,
+        calibrations=rows.calibrations,
         examples=examples,
-        worst=shown_paths.worst_trials(compared, found, further=of_topics, errors=by_start),
+        worst=shown_paths.worst_trials(compared, found, further=rows.of_topics, errors=by_start),
         path_errors=by_start.on_path,
         outages=(*forced, *shown_paths.real_outages(compared)),
-        budgets=with_other_grounds(
-            [one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)], used
-        ),
+        budgets=with_other_grounds(budgets, rows.calibrations),
         gates=tuple(
             report.verdict_on(gate, run.name, passed=False, unusable=unusable)
             if unusable
@@ -274,8 +251,108 @@ def report_on(
         usable=not unusable,
         baseline=baseline,
         by_turning=by_turning,
-        notes=(*of_sensors, *topic_notes),
+        notes=rows.notes,
     )  # fmt: skip
+
+
+class _Runs(NamedTuple):
+    """The run of a report in three forms, which are the same where the request changes nothing.
+
+    Attributes
+    ----------
+    with_events : trials may cross slip events
+    filtered : with the filter's poses; each slip event is a gap where the request leaves slip events out
+    compared : with the poses that trials are compared with
+    """
+
+    with_events: Run
+    filtered: Run
+    compared: Run
+
+    @classmethod
+    def of(cls, run: Run, request: ReportRequest) -> _Runs:
+        """Return the forms of a run.
+
+        Raises
+        ------
+        RunError
+            The reference is ``smoothed`` and the run has no smoothed states.
+        """
+        if request.with_jumps:
+            run = replace(run, sensors=replace(run.sensors, jumps=()))
+        # No trial, window or forced outage crosses a gap.
+        filtered = replace(run, in_gap=run.in_gap | run.slipping) if request.without_events else run
+        return cls(run, filtered, with_smoothed_reference(filtered) if request.reference == "smoothed" else filtered)
+
+
+def _outage_plans(run: Run, request: ReportRequest) -> list[tuple[tuple[int, int], ...]]:
+    """Return the begins and ends [ns] of the forced outages of each length."""
+    lengths_s = forced_lengths_s(run, request)
+    if request.outage_at_s and not lengths_s:
+        raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
+    return [shown_paths.plan_outages(run, length, request.outage_at_s) for length in lengths_s]
+
+
+def _horizons_of(run: Run, request: ReportRequest, limits: Iterable[Gate]) -> list[float]:
+    """Return the requested horizons [m], else the configured ones, and the horizons of acceptance limits."""
+    horizons_m = list(request.horizons_m if request.horizons_m is not None else run.config.dropout.horizons_m)
+    for at_m in (gate.horizon_m for gate in limits):
+        if at_m is not None and not any(math.isclose(at_m, horizon, rel_tol=1e-9) for horizon in horizons_m):
+            horizons_m.append(at_m)
+    return horizons_m
+
+
+class _TestedRows(NamedTuple):
+    """The rows of a report that do not come from the filter's ICRs.
+
+    Attributes
+    ----------
+    of_calibrations, of_topics : their rows
+    calibrations : the record of each used calibration
+    notes : about the sensors of calibrations, and about topics
+    found : the rows of this log's own models; None where they were left out
+    left_out : why they were left out
+    """
+
+    of_calibrations: Sequence[ComparedRow]
+    of_topics: Sequence[ComparedRow]
+    calibrations: tuple[UsedCalibration, ...]
+    notes: tuple[Note, ...]
+    found: ComparedModels | None
+    left_out: str
+
+    @property
+    def all(self) -> list[ComparedRow]:
+        """All rows, in the order of the report."""
+        return [*(() if self.found is None else self.found.rows), *self.of_calibrations, *self.of_topics]
+
+
+def _tested_rows(
+    runs: _Runs, calibrations: Sequence[Calibration], scored: Sequence[TopicPoses], request: ReportRequest, watch: Watch
+) -> _TestedRows:
+    """Return the rows of calibrations, of scored topics and of this log's own models."""
+    filtered, compared = runs.filtered, runs.compared
+    watch("calibrations")
+    used, of_calibrations, notes = _calibration_rows(compared, filtered, calibrations, request)
+    of_topics, topic_notes = topic_rows(compared, track_of(compared), scored) if scored else ([], [])
+    found, left_out = None, ""
+    if request.ladder:
+        watch("comparing models")
+        try:
+            found = compare_models(
+                compared, measured_headings(filtered), calibrations, filtered, refit_sensors=request.refit_sensors
+            )
+        except DataError as err:
+            left_out = f"{err.why}, {err.advice}"
+    return _TestedRows(of_calibrations, of_topics, used, (*notes, *topic_notes), found, left_out)
+
+
+def _contradicted(run: Run, errors: report.OpenLoopErrors, why: Note) -> tuple[Run, report.OpenLoopErrors]:
+    """Return a run and its errors as not usable. The errors stay in the report: they show the contradiction."""
+    document = msgspec.structs.replace(
+        run.document, usable=False, unusable_because=why.text, recommended=None, notes=(*run.document.notes, why)
+    )
+    return replace(run, document=document), replace(errors, run_document=document)
 
 
 def _scored_topics(request: ReportRequest, log: str | Path | None) -> Sequence[TopicPoses]:

@@ -36,9 +36,9 @@ from icrtool.motion.recording import MOST_TRIALS, TrialErrors, Trials
 from icrtool.records import dropout_document as documents
 from icrtool.records.choices import Starts
 from icrtool.records.plain_data import known, plain
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.rows import row_of
 from icrtool.records.run import Run, track_of
+from icrtool.records.stages import Watch, unwatched
 from icrtool.records.text import counted
 
 LARGEST_TABLE_BYTES = 96 << 20
@@ -79,6 +79,7 @@ def measure_errors(
     starts_of_further: Ints | None = None,
     sink: ErrorSink | None = None,
     track: Track | None = None,
+    watch: Watch = unwatched,
 ) -> OpenLoopErrors:
     """Return the errors of all models; `icrtool.dropout` describes the other parameters and the exceptions.
 
@@ -87,6 +88,7 @@ def measure_errors(
     further : additional models whose numbers do not come from the filter
     starts_of_further : start states for `further` and for all heading errors; closer starts give nearly equal trials
     track : `icrtool.records.run.track_of` the run, where it exists already, because it is large for a long log
+    watch : called before each row
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {counted(len(run.table), 'state')}", "at least two are needed")
@@ -96,55 +98,38 @@ def measure_errors(
     if len({model.name for model in predictors}) < len(predictors):
         raise ValueError("two models have the same name")
     standing, learned = standing_states(track), first_learned(run)
-    sparse = starts_of_further
-    if sparse is None:
-        sparse = np.flatnonzero(~standing)[:: max(np.count_nonzero(~standing) // MOST_TRIALS, 1)].copy()
+    sparse = starts_of_further if starts_of_further is not None else _sparse_starts(standing)
     few = _errors_of_few(track, predictors, Trials(sparse, counted_ends(track, horizons, starts, sparse)))
+    found: list[list[_AtHorizon]] = [[] for _ in predictors]
     counts: list[TrialCounts] = []
     drawn: list[list[DrawnTrials]] = []
-    found: list[list[_AtHorizon]] = [[] for _ in predictors]
-    before: list[documents.ErrorRow] = []
-    after: list[documents.ErrorRow] = []
-    together = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
+    before, after = list[documents.ErrorRow](), list[documents.ErrorRow]()
+    at_once = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
     with ThreadPoolExecutor(TRIAL_THREADS) as pool:
-        for columns in [slice(begin, begin + together) for begin in range(0, len(horizons), together)]:
-            group = horizons[columns]
-            ends = counted_ends(track, group, starts).T
-            counts.append(count_trials(ends.T))
-            blocks = _blocks(track.distance, group, (one >= 0 for one in ends))
-            slipping = _slipping_trials(run, ends)
-            for model, rows, of_few in zip(predictors, found, few, strict=True):
-                give_back_freed()
+        # One after the other: all columns of a long log together would fill the memory.
+        each = pool.map if at_once > TRIAL_THREADS else map
+        for columns in [slice(begin, begin + at_once) for begin in range(0, len(horizons), at_once)]:
+            group, ends = horizons[columns], counted_ends(track, horizons[columns], starts).T
+            trials = _Started.of(run, track, group, ends)
+            for number, (model, of_few, rows) in enumerate(zip(predictors, few, found, strict=True), start=1):
+                watch(f"errors, row {number} of {len(predictors)}")
                 if isinstance(model, ComparedRow):
                     errors = of_few.position[:, columns]
-                    tested = _blocks(track.distance[sparse], group, np.isfinite(errors.T))
-                    touching = [None if one is None else one[sparse] for one in slipping]
-                else:
-                    errors, tested, touching = _errors(track, model, ends, pool), blocks, slipping
-                # One after the other: all columns of a long log together would fill the memory.
-                each = pool.map if together > TRIAL_THREADS else map
-                at_each = partial(_at_horizon, row_of(model.name).spread)
-                rows.extend(
-                    each(
-                        at_each, group.tolist(), errors.T, of_few.heading.T[columns], of_few.aligned.T[columns], tested,
-                        touching,
-                    )
-                )  # fmt: skip
+                    sparse_trials = trials.at(sparse, group, errors)
+                    rows.extend(_statistics(model, group, errors, of_few, columns, sparse_trials, each))
+                    if sink is not None:
+                        sink(model.name, group, _at_all_starts(errors, sparse, len(track.distance)))
+                    continue
+                errors = _errors(track, model, ends, pool)
+                rows.extend(_statistics(model, group, errors, of_few, columns, trials, each))
                 if model.name == "icr":
-                    first = len(errors) if learned is None else learned
-                    before += each(_row, group.tolist(), errors[:first].T)
-                    after += each(_row, group.tolist(), errors[first:].T)
+                    before += each(_row, group.tolist(), errors[:learned].T)
+                    after += each(_row, group.tolist(), errors[len(errors) if learned is None else learned :].T)
                 if sink is not None:
-                    if isinstance(model, ComparedRow):
-                        of_some, errors = errors, np.full((len(track.distance), len(group)), np.nan)
-                        errors[sparse] = of_some
                     sink(model.name, group, errors)
                 del errors  # frees memory before the next model
+            counts.append(count_trials(ends.T))
             drawn.append(drawn_trials(group, ends))
-    by_learning = None
-    if before:
-        at, driven = (None if learned is None else float(one[learned]) for one in (run.table.t_s, run.table.distance_m))
-        by_learning = documents.LearnedDocument("icr", at, driven, before, after)
     return OpenLoopErrors(
         run_document=run.document,
         horizons_m=horizons,
@@ -153,8 +138,75 @@ def measure_errors(
         states=len(run.table),
         standing=int(np.count_nonzero(standing)),
         reference=reference_error(run, drawn, seed),
-        by_learning=by_learning,
+        by_learning=_by_learning(run, learned, before, after),
     )
+
+
+def _sparse_starts(standing: Bools) -> Ints:
+    """Return at most about `MOST_TRIALS` of the states in which the robot drives."""
+    driving = np.flatnonzero(~standing)
+    return driving[:: max(len(driving) // MOST_TRIALS, 1)].copy()
+
+
+def _at_all_starts(errors: Floats, starts: Ints, states: int) -> Floats:
+    """Return errors (n, h) by all states of errors (k, h) of some starts; NaN at the others."""
+    whole = np.full((states, errors.shape[1]), np.nan)
+    whole[starts] = errors
+    return whole
+
+
+def _by_learning(
+    run: Run, learned: int | None, before: list[documents.ErrorRow], after: list[documents.ErrorRow]
+) -> documents.LearnedDocument | None:
+    """Return the errors of trials before and after the state in which the ICRs were learned; None without row icr."""
+    if not before:
+        return None
+    at_s, driven_m = (None if learned is None else float(one[learned]) for one in (run.table.t_s, run.table.distance_m))
+    return documents.LearnedDocument("icr", at_s, driven_m, before, after)
+
+
+class _Started(NamedTuple):
+    """The trials at some horizons (h,), by the states (n,) at which they start.
+
+    Attributes
+    ----------
+    path_m : (n,) distance driven
+    blocks : blocks of path of each horizon; None where there are too few
+    slipping : (n,) of each horizon: whether a trial touches a slip event; None in a drive without slip events
+    """
+
+    path_m: Floats
+    blocks: list[statistics.Blocks | None]
+    slipping: list[Bools | None]
+
+    @classmethod
+    def of(cls, run: Run, track: Track, horizons_m: Floats, ends: Rows) -> _Started:
+        """Return the trials that start at all states; `ends` (h, n) are the states at which they end."""
+        blocks = _blocks(track.distance, horizons_m, (one >= 0 for one in ends))
+        return cls(track.distance, blocks, _slipping_trials(run, ends))
+
+    def at(self, starts: Ints, horizons_m: Floats, errors: Floats) -> _Started:
+        """Return the trials at some starts (k,), which have errors (k, h)."""
+        path_m = self.path_m[starts]
+        slipping = [None if one is None else one[starts] for one in self.slipping]
+        return _Started(path_m, _blocks(path_m, horizons_m, np.isfinite(errors.T)), slipping)
+
+
+def _statistics(
+    model: Model | ComparedRow, horizons_m: Floats, errors: Floats, of_few: TrialErrors, columns: slice,
+    trials: _Started, each: Callable[..., Iterable[_AtHorizon]],
+) -> Iterable[_AtHorizon]:  # fmt: skip
+    """Return the statistics of a model's errors (n, h) at some horizons.
+
+    Parameters
+    ----------
+    of_few : errors of its turns and errors with aligned start headings, at all horizons
+    columns : of `of_few`, the horizons of `errors`
+    each : as `map`
+    """
+    turned, aligned = of_few.heading.T[columns], of_few.aligned.T[columns]
+    at_each = partial(_at_horizon, row_of(model.name).spread)
+    return each(at_each, horizons_m.tolist(), errors.T, turned, aligned, trials.blocks, trials.slipping)
 
 
 def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], trials: Trials) -> list[TrialErrors]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
 from dataclasses import replace
 from operator import attrgetter
 
@@ -21,6 +20,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.records.measurements import ReferenceJump, SensorData
 from icrtool.records.requests import FitRequest
 from icrtool.records.run import MeasurementOutcome, Run, WarmStart
+from icrtool.records.stages import Watch, unwatched
 from icrtool.records.tables import RobotLog
 
 
@@ -30,7 +30,7 @@ def fit_filter(
     request: FitRequest,
     *,
     warm_start: WarmStart | None = None,
-    watch: Callable[[str], None] | None = None,
+    watch: Watch = unwatched,
 ) -> Run:
     """Return the run of a log without its motion model: align the sensors, run the filter, summarise.
 
@@ -41,18 +41,17 @@ def fit_filter(
     The EKF of Pentzer 2014, Eqs. 13-25, event by event; ``filter.preset`` chooses between the paper's constants and
     start (``paper``) and constants for field logs (``field``).
     """
-    begin = watch if watch is not None else lambda _: None
-    begin("aligning")
+    watch("aligning")
     log = with_right_positions(choose_reference(log, config), config)
     measurements = align(log, config)
     inputs, datum, rejected = log.inputs, log.datum, log.rejected_fixes
     # The log's columns that the filter does not use need half of the memory of the states.
     del log
-    begin("filter")
+    watch("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=request.changes_s)
     jumps = followed_jumps(filtered.sensors, filtered.gnss, filtered.heading)
     filtered = filtered._replace(sensors=replace(filtered.sensors, jumps=jumps))
-    begin("summary")
+    watch("summary")
     run = Run(
         document=summarise(
             measurements, filtered, config, request, inputs=inputs, datum=datum, rejected_fixes=rejected
@@ -67,7 +66,7 @@ def fit_filter(
     )
     if not request.smooth:
         return run
-    begin("smoother")
+    watch("smoother")
     return replace(run, smoothed=smooth_run(run))
 
 

@@ -18,9 +18,18 @@ from icrtool.config import builtin_robots
 from icrtool.dropout_analysis.report import parse_gate
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
-from icrtool.fleet.one_log import failed, files_of, path_of
+from icrtool.fleet.one_log import files_of, path_of, row_of_failure
 from icrtool.fleet.processes import Lost, close_all, process_apart
-from icrtool.fleet.recordings import about_recording, as_text, find_recordings, is_manifest, logs_among, read_manifest
+from icrtool.fleet.recordings import (
+    FoundRecording,
+    ManifestEntry,
+    about_recording,
+    as_text,
+    find_recordings,
+    is_manifest,
+    logs_among,
+    read_manifest,
+)
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log
 from icrtool.logs.containers.source import RemoteFile
 from icrtool.output.files.formats import CHECKSUM_FILE
@@ -35,11 +44,13 @@ if TYPE_CHECKING:
 POLL_S = 1.0
 """Time between two checks of a cluster [s]."""
 
-Watch = Callable[[str, str], None]
+WatchLog = Callable[[str, str], None]
 """Called with the name of a log and its stage."""
 
 
-def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path | None = None) -> list[LogRequest]:
+def plan_requests(
+    places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path | None = None
+) -> list[LogRequest]:
     """Return a request for each recording among logs, folders and manifests.
 
     Parameters
@@ -56,63 +67,85 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
     OutputError
         `output` is a run, or something else than a directory, or holds a file of the user with the name of a result.
     """
-    for gate in batch.report.gates:
-        parse_gate(gate)
-    folder = folder or output
+    gates = [parse_gate(gate) for gate in batch.report.gates]
+    _check_output(output, folder or output, batch)
+    # A pattern of the shell may also name tables of simulated truth beside their logs. They are no manifests.
+    other_files = logs_among([place for place in places if place.is_file()])[1]
+    places = [place for place in places if place not in other_files]
+    entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
+    searched = [place for place in places if not is_manifest(place)]
+    searched += [place for entry in entries for place in entry.places]
+    baseline = _open_baseline(batch, output)
+    calibrations = tuple(
+        CalibrationInput(os.fsencode(file.absolute()), file_sha256(file)) for file in batch.calibrations
+    )
+    requests = [
+        _request_for(recording, entries, output, batch, calibrations, "" if baseline is None else baseline.digest)
+        for recording in find_recordings(searched)
+    ]
+    if baseline is not None and any(gate.relative for gate in gates):
+        baseline.check_compares(
+            (one.known.log, _content_of(path_of(one.path), baseline), one.known.robot, one.known.group)
+            for one in requests
+        )
+    return requests
+
+
+def _check_output(output: Path, folder: Path, batch: BatchRequest) -> None:
+    """Refuse a folder of results where a batch cannot write; `folder` is the folder on disk."""
     if (folder / RUN_FILE).is_file():
         raise OutputError(output, "is a run itself", "name another place for the batch")
     if folder.exists() and not folder.is_dir():
         raise OutputError(output, "a file is there", "name another place for the batch")
     check_tables(folder, page=batch.files.page)
-    # A pattern of the shell may also name tables of simulated truth beside their logs. They are no manifests.
-    left_out = logs_among([place for place in places if place.is_file()])[1]
-    places = [place for place in places if place not in left_out]
-    entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
-    searched = [place for place in places if not is_manifest(place)]
-    searched += [place for entry in entries for place in entry.places]
-    baseline, before = "", None
-    if batch.baseline is not None:
-        from icrtool.output.dropout_directory import open_baseline
 
-        if batch.baseline.resolve() == output.resolve():
-            raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")
-        before = open_baseline(batch.baseline)
-        baseline = before.digest
-    calibrations = tuple(
-        CalibrationInput(os.fsencode(file.absolute()), file_sha256(file)) for file in batch.calibrations
-    )
+
+def _open_baseline(batch: BatchRequest, output: Path) -> Baseline | None:
+    """Return the reports of the baseline of a batch; None where it has none."""
+    if batch.baseline is None:
+        return None
+    from icrtool.output.dropout_directory import open_baseline
+
+    if batch.baseline.resolve() == output.resolve():
+        raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")
+    return open_baseline(batch.baseline)
+
+
+def _request_for(
+    recording: FoundRecording, entries: Sequence[ManifestEntry], output: Path, batch: BatchRequest,
+    calibrations: tuple[CalibrationInput, ...], baseline: str,
+) -> LogRequest:  # fmt: skip
+    """Return the request for one recording.
+
+    Parameters
+    ----------
+    entries : of manifests
+    output : folder of the results
+    baseline : digest of the baseline; empty without one
+    """
+    about, settings = about_recording(recording.path, entries), batch.settings
+    builtin = about.robot in builtin_robots()
+    # The name of a robot that is not built in needs a configuration of its own.
+    if about.robot and not builtin and about.config is None and settings.file is None:
+        advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
+        raise ConfigError(f"{recording.log}: robot {about.robot!r}", "not a built-in robot", advice)
+    robot = about.robot if builtin else settings.robot if not about.robot else None
+    config = settings._replace(file=about.config or settings.file, robot=robot).load()
+    # The key does not depend on whether a page is asked for: `find_finished_row` looks for the file report.html.
+    files = replace(batch.files, page=True, overwrite=False)
     # The stem is in the name of the row.
     named = [(as_text(file.stem), one.sha256) for file, one in zip(batch.calibrations, calibrations, strict=True)]
-    requests = []
-    for one in find_recordings(searched):
-        known, settings = about_recording(one.path, entries), batch.settings
-        builtin = known.robot in builtin_robots()
-        # The name of a robot that is not built in needs a configuration of its own.
-        if known.robot and not builtin and known.config is None and settings.file is None:
-            advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
-            raise ConfigError(f"{one.log}: robot {known.robot!r}", "not a built-in robot", advice)
-        robot = known.robot if builtin else settings.robot if not known.robot else None
-        config = settings._replace(file=known.config or settings.file, robot=robot).load()
-        # The key does not depend on whether a page is asked for: `finished` looks for the file report.html.
-        files = replace(batch.files, page=True, overwrite=False)
-        asked = [config.effective(), __version__, batch.report, files, known.robot, baseline, *named]
-        row = FleetLog(
-            one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot or config.robot.name or "", group=known.group,
-            tags=known.tags, key=sha256(msgspec.json.encode(asked, order="sorted")).hexdigest(),
-        )  # fmt: skip
-        # Workers of a cluster may have another working directory.
-        request = LogRequest(
-            path=os.fsencode(one.path.absolute()), known=row, folder=os.fsencode(output.absolute()),
-            config=config, report=batch.report, files=batch.files, calibrations=calibrations,
-            baseline=os.fsencode(batch.baseline.absolute()) if batch.baseline is not None else b"",
-        )  # fmt: skip
-        requests.append(request)
-    if before is not None and any(parse_gate(gate).relative for gate in batch.report.gates):
-        before.check_compares(
-            (one.known.log, _content_of(path_of(one.path), before), one.known.robot, one.known.group)
-            for one in requests
-        )
-    return requests
+    keyed = [config.effective(), __version__, batch.report, files, about.robot, baseline, *named]
+    row = FleetLog(
+        recording.log, f"{RUNS}/{recording.name}", "failed", robot=about.robot or config.robot.name or "",
+        group=about.group, tags=about.tags, key=sha256(msgspec.json.encode(keyed, order="sorted")).hexdigest(),
+    )  # fmt: skip
+    # Workers of a cluster may have another working directory.
+    return LogRequest(
+        path=os.fsencode(recording.path.absolute()), known=row, folder=os.fsencode(output.absolute()),
+        config=config, report=batch.report, files=batch.files, calibrations=calibrations,
+        baseline=os.fsencode(batch.baseline.absolute()) if batch.baseline is not None else b"",
+    )  # fmt: skip
 
 
 def _content_of(path: Path, baseline: Baseline) -> tuple[str, ...]:
@@ -122,7 +155,7 @@ def _content_of(path: Path, baseline: Baseline) -> tuple[str, ...]:
     return tuple(file_sha256(file) for file in files_of_log(path))
 
 
-def finished(request: LogRequest, folder: Path) -> FleetLog | None:
+def find_finished_row(request: LogRequest, folder: Path) -> FleetLog | None:
     """Return the row of a log that an earlier batch processed with the same input, configuration and version.
 
     A log that failed by its content, and would fail again, counts as processed.
@@ -145,7 +178,7 @@ def finished(request: LogRequest, folder: Path) -> FleetLog | None:
 
 
 def run_batch(
-    requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: Watch | None = None,
+    requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: WatchLog | None = None,
     lost: Lost = str, folder: Path | None = None,
 ) -> Generator[FleetLog, None, None]:  # fmt: skip
     """Yield the row of each log when it is done; logs whose process died or hung are tried once more at the end.
@@ -159,7 +192,7 @@ def run_batch(
     """
     todo: list[LogRequest] = []
     for request in requests:
-        done = finished(request, folder or path_of(request.folder)) if not batch.redo else None
+        done = find_finished_row(request, folder or path_of(request.folder)) if not batch.redo else None
         if done is not None:
             yield done
         else:
@@ -179,13 +212,13 @@ def run_batch(
 
 
 def _all_of(
-    requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: Watch | None, lost: Lost
+    requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: WatchLog | None, lost: Lost
 ) -> Generator[tuple[LogRequest, FleetLog], None, None]:
     pending: dict[Future[FleetLog], LogRequest] = {}
     try:
         for request in requests:
             if why := lost():
-                yield request, failed(request, why, repeatable=False)
+                yield request, row_of_failure(request, why, repeatable=False)
                 continue
             extra = (partial(watch, request.known.log),) if watch and isinstance(executor, ThreadPoolExecutor) else ()
             pending[executor.submit(process_apart, request.encode(), batch.timeout_s, *extra)] = request
@@ -197,12 +230,12 @@ def _all_of(
                     row = future.result()
                 except (CancelledError, OSError) as err:
                     reason = f"lost by the cluster ({str(err) or type(err).__name__})"
-                    row = failed(pending[future], reason, repeatable=False)
+                    row = row_of_failure(pending[future], reason, repeatable=False)
                 yield pending[future], row
             if waiting and (why := lost()):
                 for future in waiting:
                     future.cancel()
-                    yield pending[future], failed(pending[future], why, repeatable=False)
+                    yield pending[future], row_of_failure(pending[future], why, repeatable=False)
                 return
     except BaseException:
         for future in pending:

@@ -18,7 +18,7 @@ from icrtool.errors import IcrToolError, LogChangedError, OutputError
 from icrtool.fleet.recordings import as_text
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, log_name
 from icrtool.output.files.remote_place import write_below
-from icrtool.pipeline import Stage, fit_into, report_into
+from icrtool.pipeline import fit_into, report_into
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.fleet_document import FleetFile, FleetLog, fleet_verdict, next_low_name
 from icrtool.records.places import UrlPath, place_of
@@ -26,6 +26,7 @@ from icrtool.records.plain_data import plain
 from icrtool.records.requests import CalibrationInput, LogRequest
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.samples import InputFile
+from icrtool.records.stages import Watch
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
@@ -41,34 +42,34 @@ def path_of(name: bytes) -> Path:
     return place_of(os.fsdecode(name))
 
 
-def process(request: LogRequest, stage: Stage) -> FleetLog:
+def process_log(request: LogRequest, watch: Watch) -> FleetLog:
     """Fit a log, analyse the run, write both, and return its row; the row of an unusable log states the reason.
 
     Parameters
     ----------
-    stage : called with what is done next
+    watch : called with what is done next
     """
     begun = time.monotonic()
     path, folder = path_of(request.path), path_of(request.folder)
     try:
-        row = _results(request, stage)
+        row = _results(request, watch)
     except IcrToolError as err:
         # A full disk may have space the next time, a log may be complete; errors of its content come again.
         reason = err.text_without(str(path), str(folder / request.known.run), log_name(path))
-        row = failed(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
+        row = row_of_failure(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
     except OSError as err:
         # The log was removed meanwhile, or its disk fails.
         place = escaped(str(err.filename or path))
-        row = failed(request, f"{place}: {err.strerror or err}", repeatable=False)
+        row = row_of_failure(request, f"{place}: {err.strerror or err}", repeatable=False)
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
     try:
         write_below(folder, request.row_file, msgspec.json.encode(row))
     except OutputError as err:
-        row = failed(request, str(err), repeatable=False)
+        row = row_of_failure(request, str(err), repeatable=False)
     return row
 
 
-def failed(request: LogRequest, reason: str, *, details: str = "", repeatable: bool) -> FleetLog:
+def row_of_failure(request: LogRequest, reason: str, *, details: str = "", repeatable: bool) -> FleetLog:
     """Return the row of a log that could not be processed."""
     inputs: tuple[FleetFile, ...] = ()
     with suppress(OSError):  # a log that was removed meanwhile, or is a device
@@ -100,14 +101,14 @@ def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, .
     return tuple(found)
 
 
-def _results(request: LogRequest, stage: Stage) -> FleetLog:
+def _results(request: LogRequest, watch: Watch) -> FleetLog:
     """Fit and analyse a log, write run and report, and return its row."""
     from icrtool.output.dropout_directory import open_baseline
 
     path, folder = path_of(request.path), path_of(request.folder)
     asked, files = request.report, request.files
     calibrations = [_calibration_of(one) for one in request.calibrations]
-    with fit_into(folder / request.known.run, path, request.config, asked.fit, files, stage, inside=folder) as found:
+    with fit_into(folder / request.known.run, path, request.config, asked.fit, files, watch, inside=folder) as found:
         run, partial = found
         before = None
         if request.baseline:
@@ -115,7 +116,7 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
             before = open_baseline(path_of(request.baseline)).find(
                 known.log, run.document.content, known.robot, known.group
             )
-        report = report_into(partial, run, asked, files, stage, calibrations=calibrations, baseline=before)
+        report = report_into(partial, run, asked, files, watch, calibrations=calibrations, baseline=before)
     summary = run.document
     icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}
     controller = summary.controller

@@ -30,12 +30,12 @@ import msgspec
 from msgspec.structs import replace
 
 from icrtool.errors import ConfigError
-from icrtool.fleet.one_log import failed, process
+from icrtool.fleet.one_log import process_log, row_of_failure
 from icrtool.logs.containers.recording_files import files_of_log
-from icrtool.pipeline import Stage
 from icrtool.records.fleet_document import FleetLog
-from icrtool.records.process_resources import give_back_freed, remove_unfinished
+from icrtool.records.process_resources import remove_unfinished
 from icrtool.records.requests import LogRequest, decode_request
+from icrtool.records.stages import Watch, unwatched
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -79,14 +79,14 @@ _idle: list[Worker] = []
 """Processes that wait for a log; each thread that asks takes one, or starts one."""
 
 
-def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) -> FleetLog:
+def process_apart(request: bytes, timeout_s: float, watch: Watch = unwatched) -> FleetLog:
     """Process a log in a process of its own; if the process hangs or dies, the row states the reason.
 
     Parameters
     ----------
     request : of `LogRequest.encode`
     timeout_s : after which the process is killed
-    stage : called with what is done next, where the caller is on the same machine
+    watch : called with what is done next, where the caller is on the same machine
     """
     if _over.is_set():
         raise CancelledError
@@ -94,7 +94,7 @@ def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) 
         worker = _idle.pop()
     except IndexError:
         worker = Worker()
-    row = worker.run(decode_request(request), timeout_s, stage)
+    row = worker.run(decode_request(request), timeout_s, watch)
     if worker in _all:
         _idle.append(worker)
     return row
@@ -218,7 +218,7 @@ class Worker:
         self._answers = _lines_of(self._process.stdout, lambda lines: lines.put(b""))
         _all.add(self)
 
-    def run(self, request: LogRequest, timeout_s: float, stage: Stage | None) -> FleetLog:
+    def run(self, request: LogRequest, timeout_s: float, watch: Watch) -> FleetLog:
         """Process a log, as `process_apart`."""
         begun, begin_of_errors = time.monotonic(), self._errors.seek(0, os.SEEK_END)
         why = details = ""
@@ -230,8 +230,7 @@ class Worker:
                 answer = _ANSWER.decode(self._answers.get(timeout=max(left_s, 0.0)))
                 if isinstance(answer, FleetLog):
                     return answer
-                if stage is not None:
-                    stage(answer)
+                watch(answer)
         except queue.Empty:
             why = f"took longer than {timeout_s:g} s and was ended"
         except (OSError, ValueError):  # it died, perhaps in the middle of a line
@@ -242,7 +241,7 @@ class Worker:
             why += f": {details.splitlines()[-1]}" if details else ""
         self.close()
         took_s = round(time.monotonic() - begun, 3)
-        return replace(failed(request, why, details=details, repeatable=False), took_s=took_s)
+        return replace(row_of_failure(request, why, details=details, repeatable=False), took_s=took_s)
 
     def ask_to_end(self) -> None:
         """Close its input: the process removes unfinished files and ends."""
@@ -297,10 +296,6 @@ def main() -> None:
         output.write(msgspec.json.encode(answer) + b"\n")
         output.flush()
 
-    def begin(stage: str) -> None:
-        give_back_freed()
-        send(stage)
-
     def end(_: Lines) -> None:
         # The process that asked has ended, or ends this one, perhaps in the middle of a log.
         remove_unfinished()
@@ -308,7 +303,7 @@ def main() -> None:
 
     lines = _lines_of(requests, end)
     while True:
-        send(process(decode_request(lines.get()), begin))
+        send(process_log(decode_request(lines.get()), send))
 
 
 if __name__ == "__main__":

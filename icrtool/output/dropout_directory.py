@@ -30,6 +30,7 @@ from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
 from icrtool.records.rows import IN_CSV
 from icrtool.records.run_document import known_content
+from icrtool.records.stages import Watch, unwatched
 from icrtool.records.text import counted, escaped
 
 REPORT_FILE = "report.json"
@@ -46,6 +47,7 @@ def write_report(
     plots: tuple[str, ...] = ("png",),
     figures: FigureSet = "default",
     stamp_ns: Ints | None = None,
+    watch: Watch = unwatched,
     inside: Path | None = None,
 ) -> DropoutReport:
     """Write a report, whole or not at all, in place of an old one; its files are added to the list of its run.
@@ -56,6 +58,7 @@ def write_report(
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     figures : ``all``: the paper's figures too
     stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: trials are not written
+    watch : called with the name of each picture before it is drawn
     inside : as in `icrtool.output.files.atomic.check_directory`
 
     Raises
@@ -67,7 +70,7 @@ def write_report(
         with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
             report = analyse(sink)
         if plots:
-            figure_catalogue.draw_figures("report", report, partial / "plots", plots, figures)
+            figure_catalogue.draw_figures("report", report, partial / "plots", plots, figures, watch)
         write_tables(report, partial)
         names = [path.relative_to(partial).as_posix() for path in sorted(partial.rglob("*")) if path.is_file()]
         if in_run := is_run_directory(directory.parent):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from icrtool.output.text_blocks import Chart
 from icrtool.records.choices import FigureSet
-from icrtool.records.process_resources import give_back_freed
+from icrtool.records.stages import Watch, unwatched
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -174,23 +174,31 @@ def drive_charts(position_word: str) -> tuple[Chart, ...]:
     )
 
 
-def figures_of(of: Subject, subject: object, figures: FigureSet = "default") -> Iterator[tuple[str, Figure]]:
-    """Draw each figure for which a subject has numbers; yield it with the name of its file."""
+def figures_of(
+    of: Subject, subject: object, figures: FigureSet = "default", watch: Watch = unwatched
+) -> Iterator[tuple[str, Figure]]:
+    """Draw each figure for which a subject has numbers; yield it with the name of its file.
+
+    `watch` is called with the name of each picture before it is drawn.
+    """
     for name, entry in FIGURES.items():
         if entry.of == of and (figures == "all" or not entry.further):
             for part, more in entry.parts(subject).items():
+                watch(f"picture {name}{part}")
                 yield f"{name}{part}", entry.draw(subject, *more)
 
 
 def draw_figures(
-    of: Subject, subject: object, directory: Path, formats: tuple[str, ...], figures: FigureSet = "default"
-) -> None:
+    of: Subject, subject: object, directory: Path, formats: tuple[str, ...], figures: FigureSet = "default",
+    watch: Watch = unwatched,
+) -> None:  # fmt: skip
     """Write the figures of a run or a report into a directory.
 
     Parameters
     ----------
     directory : is made if it does not exist
     formats : of ``png``, ``svg`` and ``pdf``
+    watch : called with the name of each picture before it is drawn
 
     Raises
     ------
@@ -200,9 +208,8 @@ def draw_figures(
     directory.mkdir(exist_ok=True)
     from icrtool.output.figures.style import save_figure
 
-    for name, figure in figures_of(of, subject, figures):
+    for name, figure in figures_of(of, subject, figures, watch):
         save_figure(figure, directory / name, formats)
-        give_back_freed()
 
 
 def entry_of(file: str) -> tuple[Entry, str] | None:

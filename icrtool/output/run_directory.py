@@ -27,11 +27,11 @@ from icrtool.output.files.run_columns import MEASUREMENTS_FILE
 from icrtool.records.choices import FigureSet, StatesFormat
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_regular, is_special, place_of, read_regular
 from icrtool.records.plain_data import Record, plain
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import FitRequest
 from icrtool.records.run import Run
 from icrtool.records.run_document import EVENT_COLUMNS, RUN_SCHEMA, EventDocument, RunDocument
 from icrtool.records.samples import InputFile
+from icrtool.records.stages import Watch, unwatched
 from icrtool.records.tables import States
 from icrtool.records.text import LONGEST_NAME, escaped, escaped_texts, listed, shortened
 
@@ -186,6 +186,7 @@ def new_run(
     plots: tuple[str, ...] = ("png",),
     figures: FigureSet = "default",
     note: Callable[[str], None] | None = None,
+    watch: Watch = unwatched,
     inside: Path | None = None,
 ) -> Iterator[Path]:
     """Write a run and give its new directory; at the end of the block the directory is put in its place.
@@ -200,6 +201,7 @@ def new_run(
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     figures : ``all``: the paper's figures too
     note : called with one line if an old run was replaced and files that the new run does not have were removed
+    watch : called with the name of each picture before it is drawn
     inside : as in `check_directory`
 
     Raises
@@ -219,7 +221,7 @@ def new_run(
         before = set(names_in(place))
         states_written = pool.submit(run_columns.write_states, run.table, partial / f"states.{states}", states)
         if plots:
-            figure_catalogue.draw_figures("run", run, partial / "plots", plots, figures)
+            figure_catalogue.draw_figures("run", run, partial / "plots", plots, figures, watch)
         if run.smoothed is not None:
             run_columns.write_states(run.smoothed, partial / f"smoothed.{states}", states)
         run_columns.write_measurements(run, partial / MEASUREMENTS_FILE)
@@ -347,7 +349,6 @@ def _run_in(directory: Path, place: Path, *, whole: bool) -> Run:
         raise RunError(directory, f"its configuration is not of this version ({err.what})", FIT_AGAIN) from err
     except (OSError, ValueError, OverflowError) as err:
         raise RunError(directory, f"cannot be read ({err})", FIT_AGAIN) from err
-    give_back_freed()
     return run
 
 

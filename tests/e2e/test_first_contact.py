@@ -151,9 +151,9 @@ def test_info_of_a_log_that_cannot_be_fitted_states_why(icrtool, tmp_path: Path)
 def test_stages_are_lines_with_v_and_nothing_without(icrtool) -> None:
     _, _, err = icrtool("fit", TRACKED, "-v", "--plots", "none")
     stages = [line.partition(": ")[2] for line in err.splitlines() if line.startswith("tracked_curved.bag: ")]
-    assert stages == ["reading", "aligning", "filter", "summary", "writing"]
+    assert stages == ["reading", "aligning", "filter", "summary", "motion model", "writing"]
     _, _, err = icrtool("dropout-report", "--plots", "none", "--no-ladder")
-    assert "dropout analysis" not in err
+    assert "outages and examples" not in err
 
 
 def test_on_a_terminal_the_stage_is_rewritten_and_cleared(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from threading import Lock
 
-from icrtool.fleet.one_log import process
+from icrtool.fleet.one_log import process_log
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.requests import decode_request
 
@@ -18,4 +18,4 @@ def in_this_process(request: bytes, timeout_s: float, stage: object = None) -> F
     """
     # Two threads must not be the first to use a module (`icrtool.cli.when_used`).
     with ONE_AT_A_TIME:
-        return process(decode_request(request), lambda _: None)
+        return process_log(decode_request(request), lambda _: None)

@@ -16,9 +16,9 @@ import pytest
 from icrtool.config import ConfigSources
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet import processes
-from icrtool.fleet.batch import finished, plan, run_batch
+from icrtool.fleet.batch import find_finished_row, plan_requests, run_batch
 from icrtool.fleet.fleet_files import write_fleet
-from icrtool.fleet.one_log import process
+from icrtool.fleet.one_log import process_log
 from icrtool.fleet.processes import default_jobs
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.requests import BatchRequest, LogRequest, ReportRequest, ResultFiles
@@ -82,7 +82,7 @@ def run(
 ) -> dict[str, FleetLog]:
     files = ResultFiles(page=bool(options.pop("page", True)))
     asked = BatchRequest(ConfigSources(None, robot, sets), files=files, timeout_s=60.0, **options)  # type: ignore[arg-type]
-    requests = plan([season], season.parent / "out", asked)
+    requests = plan_requests([season], season.parent / "out", asked)
     with ThreadPoolExecutor(jobs) as executor:
         rows = list(run_batch(requests, executor, asked))
     assert sorted(row.log for row in rows) == sorted(request.known.log for request in requests), "one row a log"
@@ -109,7 +109,7 @@ def test_a_log_that_fails_hangs_or_dies_costs_only_itself(season: Path) -> None:
 
 def test_a_log_that_hangs_is_ended(season: Path) -> None:
     add(season, "hang", "a")
-    requests = plan([season], season.parent / "out", BatchRequest())
+    requests = plan_requests([season], season.parent / "out", BatchRequest())
     begun = time.monotonic()
     with ThreadPoolExecutor(2) as executor:
         rows = list(run_batch(requests, executor, BatchRequest(timeout_s=10.0)))
@@ -164,14 +164,14 @@ def test_a_calibration_that_changes_while_a_batch_runs_fails_the_log_until_the_n
     add(season, "a")
     file = season.parent / "cal.json"
     file.write_text("1")
-    (request,) = plan([season], season.parent / "out", BatchRequest(calibrations=(file,)))
+    (request,) = plan_requests([season], season.parent / "out", BatchRequest(calibrations=(file,)))
     reasons = {}
     for content in ("2", None):
         if content is None:
             file.unlink()
         else:
             file.write_text(content)
-        row = process(request, lambda _: None)
+        row = process_log(request, lambda _: None)
         assert (row.status, row.repeatable) == ("failed", False)
         reasons[content] = row.reason
     assert "cal.json: changed since the batch began" in reasons["2"]
@@ -205,7 +205,7 @@ def test_a_finished_log_without_a_page_is_processed_again_where_one_is_asked_for
 def test_an_interrupted_batch_ends_its_processes_and_is_continued(season: Path) -> None:
     add(season, "a", "hang1", "hang2", "hang3")
     asked = BatchRequest(timeout_s=50)
-    requests = plan([season], season.parent / "out", asked)
+    requests = plan_requests([season], season.parent / "out", asked)
     begun = time.monotonic()
     with ThreadPoolExecutor(2) as executor:
         rows = run_batch(requests, executor, asked)
@@ -221,7 +221,7 @@ def test_an_interrupted_batch_ends_its_processes_and_is_continued(season: Path) 
 
 def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
     add(season, "hang")
-    request = plan([season], season.parent / "out", BatchRequest())[0]
+    request = plan_requests([season], season.parent / "out", BatchRequest())[0]
     process = subprocess.Popen(
         processes.PROCESS_COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
@@ -239,7 +239,9 @@ def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
 def test_a_request_survives_its_journey_whatever_its_path(season: Path) -> None:
     name = os.fsdecode(b"\xff\n.mcap")
     (season / name).write_bytes(b"\x89MCAP0\r\n")
-    request = plan([season], season.parent / "out", BatchRequest(ConfigSources(sets=("robot.track_width_m=0.5",))))[0]
+    request = plan_requests(
+        [season], season.parent / "out", BatchRequest(ConfigSources(sets=("robot.track_width_m=0.5",)))
+    )[0]
     from icrtool.records.requests import decode_request
 
     again = decode_request(request.encode())
@@ -256,28 +258,28 @@ def test_the_manifest_gives_robot_group_and_tags(season: Path) -> None:
     (season / "m.csv").write_text(
         "log,robot,config,group,tags\na.mcap,husky-a200,,grass,wet\nb.mcap,mule,own.toml,ice,\n"
     )
-    requests = plan([season / "m.csv"], season.parent / "out", BatchRequest())
+    requests = plan_requests([season / "m.csv"], season.parent / "out", BatchRequest())
     first, second = requests
     assert (first.known.robot, first.known.group, first.known.tags) == ("husky-a200", "grass", ("wet",))
     assert first.config.robot.name == "husky-a200"
     assert (second.known.robot, second.config.robot.track_width_m) == ("mule", 0.9)
     (season / "m.csv").write_text("log,robot\na.mcap,husky-a20\n")
     with pytest.raises(ConfigError, match="husky-a20"):
-        plan([season / "m.csv"], season.parent / "out", BatchRequest())
+        plan_requests([season / "m.csv"], season.parent / "out", BatchRequest())
 
 
 def test_what_cannot_be_planned_is_refused_at_once(season: Path, tmp_path: Path) -> None:
     with pytest.raises(LogError, match="no recording"):
-        plan([season], tmp_path / "out", BatchRequest())
+        plan_requests([season], tmp_path / "out", BatchRequest())
     add(season, "a")
     with pytest.raises(ConfigError, match="gate"):
-        plan([season], tmp_path / "out", BatchRequest(report=ReportRequest(gates=("nonsense",))))
+        plan_requests([season], tmp_path / "out", BatchRequest(report=ReportRequest(gates=("nonsense",))))
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="a file is there"):
-        plan([season], tmp_path / "file", BatchRequest())
+        plan_requests([season], tmp_path / "file", BatchRequest())
     (tmp_path / "run.json").touch()
     with pytest.raises(OutputError, match="is a run itself"):
-        plan([season], tmp_path, BatchRequest())
+        plan_requests([season], tmp_path, BatchRequest())
 
 
 def test_memory_bounds_how_many_logs_run_at_once(season: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -322,9 +324,9 @@ def test_a_finished_log_of_a_moved_folder_is_found_by_content(season: Path, tmp_
     run(season)
     moved = tmp_path / "moved"
     season.rename(moved)
-    request = plan([moved], tmp_path / "out", BatchRequest())[0]
+    request = plan_requests([moved], tmp_path / "out", BatchRequest())[0]
     assert isinstance(request, LogRequest)
-    found = finished(request, tmp_path / "out")
+    found = find_finished_row(request, tmp_path / "out")
     assert found is not None
     other = msgspec.structs.replace(request.known, key="other")
-    assert finished(msgspec.structs.replace(request, known=other), tmp_path / "out") is None
+    assert find_finished_row(msgspec.structs.replace(request, known=other), tmp_path / "out") is None
