@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from icrtool.config import Config
+from icrtool.records.places import Below, Place, path_of
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import FitRequest, ReportRequest, ResultFiles
 from icrtool.records.run import Run, WarmStart, check_type
@@ -109,7 +110,7 @@ def _giving_back(watch: Watch) -> Watch:
 
 @contextmanager
 def fit_into(
-    directory: Path,
+    directory: Place,
     log: Path,
     config: Config,
     request: FitRequest,
@@ -119,37 +120,36 @@ def fit_into(
     warm_start: Path | None = None,
     share: Callable[[float], None] | None = None,
     note: Callable[[str], None] | None = None,
-    inside: Path | None = None,
 ) -> Iterator[tuple[Run, Path]]:
     """Fit a log, write its run, and give the run and its new directory, which is put in place at the end of the block.
 
     Parameters
     ----------
-    directory : may be at an address, as `icrtool.output.files.remote_place.on_disk` takes it
+    directory : of the run; may be at an address, as `icrtool.output.files.remote_place.on_disk` takes it
     warm_start : run or calibration file to start from
     share : called with the share of the log that was read
-    note, inside : as in `icrtool.output.run_directory.new_run`
+    note : as in `icrtool.output.run_directory.new_run`
     """
     from icrtool.logs.read_log import read_log
     from icrtool.output.files.remote_place import on_disk
     from icrtool.output.run_directory import check_target, new_run, replaced_log
 
     start, watch = _warm_start(warm_start, config, note), _giving_back(watch)
-    with on_disk(directory, begin=watch) as place:
-        inside = inside if place is directory else None
-        check_target(place, log, overwrite=files.overwrite, inside=inside)
+    path = path_of(directory)
+    with on_disk(path, begin=watch) as on_this_disk:
+        place = directory if on_this_disk is path else on_this_disk
+        check_target(place, log, overwrite=files.overwrite)
         watch("reading")
         # No name here holds the log: its columns are freed where they are needed no longer.
         run = fit_log(
             read_log(log, config, share, start=request.start, end=request.end), config, request,
             warm_start=start, watch=watch,
         )  # fmt: skip
-        if note is not None and (before := replaced_log(place, run)) is not None:
-            note(f"{directory}: replaced the run of another recording ({before})")
+        if note is not None and (before := replaced_log(on_this_disk, run)) is not None:
+            note(f"{path}: replaced the run of another recording ({before})")
         watch("writing")
         with new_run(
             run, place, states=files.states, plots=files.plots, figures=files.figures, note=note, watch=watch,
-            inside=inside,
         ) as partial:  # fmt: skip
             yield run, partial
 
@@ -201,12 +201,12 @@ def report_into(
 
     stamps = run.table.stamp_ns if files.trials else None
     report = write_report(
-        analysed, directory / DROPOUT_DIRECTORY, plots=files.plots, figures=files.figures, stamp_ns=stamps,
-        watch=watch, inside=directory,
+        analysed, Below(directory, DROPOUT_DIRECTORY), plots=files.plots, figures=files.figures, stamp_ns=stamps,
+        watch=watch,
     )  # fmt: skip
     if files.page:
         from icrtool.output.page.pages import write_page
 
         watch("page")
-        write_page(run, report, directory / PAGE_FILE, plots=directory, inside=directory)
+        write_page(run, report, Below(directory, PAGE_FILE), plots=directory)
     return report

@@ -143,7 +143,7 @@ def run_all(
 
     rows: list[FleetLog] = []
     with (
-        executor_of([one_log.path_of(one.path) for one in requests], *workers) as (executor, lost),
+        executor_of([one_log.path_from_bytes(one.path) for one in requests], *workers) as (executor, lost),
         view,
         closing(batches.run_batch(requests, executor, batch, view.stage, lost, folder)) as coming,
     ):

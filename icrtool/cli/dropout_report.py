@@ -10,11 +10,11 @@ import click
 
 from icrtool.cli import options, when_used
 from icrtool.cli.fit import fitted_log
-from icrtool.cli.inputs import RUNS_FOLDER, ResultPlace, RunPlace, check_run_config, logs_of, run_directories
+from icrtool.cli.inputs import RUNS_FOLDER, ResultPlace, check_run_config, logs_of, run_directories
 from icrtool.cli.options import POSITIVE, Exports, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.choices import Reference, Starts
-from icrtool.records.places import UrlPath
+from icrtool.records.places import Place, UrlPath, path_of
 from icrtool.records.text import LogText, escaped
 
 with when_used():
@@ -128,7 +128,7 @@ def dropout_report_command(
 
 def plan_sources(
     sources: tuple[Path, ...], place: ResultPlace, config: Config, printer: Printer
-) -> tuple[tuple[Path, ...], dict[Path, RunPlace]]:
+) -> tuple[tuple[Path, ...], dict[Path, Place]]:
     """Return the sources, the newest run where none is named, and the run directory of each that is a log.
 
     Everything that can be refused without reading a log is refused here: a finished run keeps its configuration and
@@ -164,7 +164,7 @@ class Given(NamedTuple):
 
 
 def report_one(
-    source: Path, place: RunPlace | None, config: Config, request: ReportRequest, files: ResultFiles, given: Given,
+    source: Path, place: Place | None, config: Config, request: ReportRequest, files: ResultFiles, given: Given,
     printer: Printer,
 ) -> DropoutReport:  # fmt: skip
     """Report on one source; `place` is the run directory of a log, None for a run."""
@@ -188,7 +188,7 @@ def report_one(
             )  # fmt: skip
     if report.baseline is not None:
         printer.warn(f"{run.name}: {change}" for change in report.baseline.changes(run.document))
-    directory = source if place is None else place.directory
+    directory = source if place is None else path_of(place)
     label, name = ("page", run_directory.PAGE_FILE) if files.page else ("written to", "dropout")
     where = text_blocks.Section("", [text_blocks.Facts([(label, escaped(str(directory / name)))])])
     printer.show([*dropout.dropout_blocks(report), where])

@@ -12,6 +12,7 @@ from icrtool.cli.inputs import RUNS_FOLDER, is_log, read_calibration_and_run
 from icrtool.cli.options import FILE, PLACE, choice, flag, option
 from icrtool.cli.printing import Printer, write_or_print
 from icrtool.records.choices import ControllerTarget, TrajectoryFormat
+from icrtool.records.places import Below
 from icrtool.records.text import escaped
 
 with when_used():
@@ -100,23 +101,23 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
     """Write a file for each path of a run."""
     directory.mkdir(parents=True, exist_ok=True)
-    files = {directory / f"{path.name}{paths.SUFFIXES[target]}": path for path in paths.paths_of(run)}
+    files = {Below(directory, f"{path.name}{paths.SUFFIXES[target]}"): path for path in paths.paths_of(run)}
     for file in files:
-        atomic.check_place(file, directory, paths.is_trajectory)
+        atomic.check_place(file, paths.is_trajectory)
     for file, path in files.items():
-        atomic.write_file(file, paths.format_trajectory(path, target), directory, paths.is_trajectory)
-        click.echo(f"written to {file}")
+        atomic.write_file(file, paths.format_trajectory(path, target), paths.is_trajectory)
+        click.echo(f"written to {file.path}")
 
 
 def _write_foxglove(run: Run, output: Path) -> None:
     """Write the MCAP file, and the layout next to it."""
-    layout = output.with_name(f"{output.stem}.layout.json")
-    atomic.check_place(layout, layout.parent, foxglove.is_layout)
+    layout = Below(output.parent, f"{output.stem}.layout.json")
+    atomic.check_place(layout, foxglove.is_layout)
     with atomic.atomic_file(output) as partial:
         foxglove.write_foxglove(run, partial)
     content = formats.json_bytes(foxglove.foxglove_layout(run))
-    atomic.write_file(layout, content, layout.parent, foxglove.is_layout)
-    click.echo(f"written to {output}; layout for Foxglove: {layout}")
+    atomic.write_file(layout, content, foxglove.is_layout)
+    click.echo(f"written to {output}; layout for Foxglove: {layout.path}")
 
 
 def _run(source: Path | None, output: Path | None = None) -> Run:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from icrtool.cli import options, when_used
-from icrtool.cli.inputs import ResultPlace, RunPlace, logs_of, run_directories
+from icrtool.cli.inputs import ResultPlace, logs_of, run_directories
 from icrtool.cli.options import PLACE, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer, error
 from icrtool.records.choices import StatesFormat
-from icrtool.records.places import UrlPath
+from icrtool.records.places import Place, UrlPath, path_of
 from icrtool.records.text import LogText, escaped
 
 with when_used():
@@ -78,15 +78,14 @@ def fit_command(
     config = settings.load()
     logs = logs_of(logs, printer)
     inputs, all_usable = Inputs("log"), True
-    for log, (directory, inside) in zip(logs, run_directories(logs, place), strict=True):
+    for log, run_place in zip(logs, run_directories(logs, place), strict=True):
         with inputs.each(log) as document:
-            place_of_run = RunPlace(directory, inside)
-            with fitted_log(log, place_of_run, config, request, files, printer, warm_start, warns=False) as (run, _):
+            with fitted_log(log, run_place, config, request, files, printer, warm_start, warns=False) as (run, _):
                 pass
             all_usable = all_usable and run.usable
             if strict and not (run.usable or printer.shows):
                 error(f"{run.name}: do not use this run: {run.document.unusable_because}")
-            where = escaped(str(directory))
+            where = escaped(str(path_of(run_place)))
             document |= {"directory": where, "run": run.summary}
             # The command that states what is wrong with the log.
             examine = shlex.join(["icrtool", "info", escaped(str(log)), "-v", *options.given(settings, request)])
@@ -98,21 +97,21 @@ def fit_command(
 
 @contextmanager
 def fitted_log(
-    log: Path, place: RunPlace, config: Config, request: FitRequest, files: ResultFiles, printer: Printer,
+    log: Path, place: Place, config: Config, request: FitRequest, files: ResultFiles, printer: Printer,
     warm_start: Path | None = None, *, warns: bool = True,
 ) -> Iterator[tuple[Run, Path]]:  # fmt: skip
     """Fit a log, and yield as `icrtool.pipeline.fit_into` does; with `warns`, print warnings and streams on stderr.
 
     A run with other settings is replaced only if `files.overwrite` is set.
     """
-    if not (files.overwrite or isinstance(place.directory, UrlPath)):
-        run_directory.check_target(place.directory, log, inside=place.inside)
-        run_directory.check_settings(place.directory, config, request)
+    if not (files.overwrite or isinstance(path_of(place), UrlPath)):
+        run_directory.check_target(place, log)
+        run_directory.check_settings(path_of(place), config, request)
     reported: list[str] = []
     with (
         printer.stages(LogText(log.name)) as stages,
         pipeline.fit_into(
-            place.directory,
+            place,
             log,
             config,
             request,
@@ -121,7 +120,6 @@ def fitted_log(
             warm_start=warm_start,
             share=stages.share,
             note=reported.append,
-            inside=place.inside,
         ) as found,  # fmt: skip
     ):
         yield found

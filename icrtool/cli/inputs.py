@@ -11,7 +11,7 @@ import click
 
 from icrtool.cli import when_used
 from icrtool.cli.printing import Printer
-from icrtool.records.places import UrlPath, place_of
+from icrtool.records.places import Below, Place, UrlPath, place_of
 from icrtool.records.text import LogText, escaped
 
 with when_used():
@@ -91,14 +91,7 @@ class ResultPlace(NamedTuple):
     into: Path | None = None
 
 
-class RunPlace(NamedTuple):
-    """Where the run of a log goes; `inside` is the folder of the runs, below which no link is followed."""
-
-    directory: Path
-    inside: Path | None
-
-
-def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[RunPlace]:
+def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[Place]:
     """Return where each log's run goes: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` for several or `into`.
 
     Logs with the same name get names from the parts in which their paths differ.
@@ -107,13 +100,13 @@ def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[RunPlace
     if output is not None and into is not None:
         raise click.UsageError("-o and --into both state where the runs go: give one of them")
     if output is not None and len(logs) == 1:
-        return [RunPlace(output, None)]
+        return [output]
     parent = output or into
     if parent is not None and (parent / run_directory.RUN_FILE).is_file():
         advice = "fitting that run again would remove the runs in it: name another place"
         raise errors.OutputError(parent, "is a run itself", advice)
     folder = parent or RUNS_FOLDER
-    return [RunPlace(folder / name, folder) for name in recordings.distinct_names(logs)]
+    return [Below(folder, name) for name in recordings.distinct_names(logs)]
 
 
 def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:

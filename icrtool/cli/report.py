@@ -13,7 +13,6 @@ from icrtool.cli import dropout_report, options, when_used
 from icrtool.cli.inputs import (
     RUNS_FOLDER,
     ResultPlace,
-    RunPlace,
     check_run_config,
     groups_of,
     is_log,
@@ -23,7 +22,7 @@ from icrtool.cli.inputs import (
 )
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, flag, option
 from icrtool.cli.printing import Inputs, Printer
-from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
+from icrtool.records.places import NOT_REGULAR, SAVE_IT, Below, Place, UrlPath, is_special, path_of
 from icrtool.records.text import escaped
 
 with when_used():
@@ -93,20 +92,20 @@ def report_command(
                 _report_on_log(source, places[source], config, report, files, given, printer)
                 if files.page:
                     continue
-                result = places[source].directory
+                result = path_of(places[source])
             _write_page(result, output, coordinates=not no_coordinates, printer=printer)
     inputs.leave("sources")
 
 
 def _report_on_log(
-    source: Path, place: RunPlace, config: Config, report: requests.ReportRequest, files: requests.ResultFiles,
+    source: Path, place: Place, config: Config, report: requests.ReportRequest, files: requests.ResultFiles,
     given: dropout_report.Given, printer: Printer,
 ) -> None:  # fmt: skip
     """Print what a log shows, fitted unless its run is there, and write its run and report."""
     request = report.configured(config)
-    there = run_directory.holds_run_of(place.directory, source, config, request.fit)
+    there = run_directory.holds_run_of(path_of(place), source, config, request.fit)
     if there:
-        dropout_report.report_one(place.directory, None, config, request, files, given, printer)
+        dropout_report.report_one(path_of(place), None, config, request, files, given, printer)
     else:
         dropout_report.report_one(source, place, config, request, files, given, printer)
 
@@ -118,10 +117,10 @@ def _write_page(source: Path, output: Path | None, *, coordinates: bool, printer
         raise errors.RunError(source, "is a run at an address", advice)
     place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
     # The usual folder of a page may hold files of a stranger.
-    inside, ours = (place.parent, run_directory.is_page) if output is None else (None, None)
-    atomic.check_place(place, inside, ours)
+    file, ours = (Below(place.parent, place.name), run_directory.is_page) if output is None else (place, None)
+    atomic.check_place(file, ours)
     page = _page_of(source, coordinates=coordinates)
-    atomic.write_file(place, page, inside, ours)
+    atomic.write_file(file, page, ours)
     printer.text(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
 
 
@@ -131,14 +130,13 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
             return _page_of_run(source, coordinates=coordinates)
     fleet = source / fleet_document.FLEET_FILE
-    if formats.schema_of(fleet, source).startswith(fleet_document.FLEET_FAMILY):
+    if formats.schema_of(Below(source, fleet_document.FLEET_FILE)).startswith(fleet_document.FLEET_FAMILY):
         with _as_written(fleet, "run icrtool batch again"):
             return pages.fleet_page(formats.read_fleet(source), source)
     if (file := pages.comparison_in(source)) is not None:
-        with _as_written(file, "run icrtool compare again"):
-            inside = source if source.is_dir() else None
-            comparison = formats.read_document(file, calibration_document.GroupComparison, inside)
-            return pages.comparison_page(comparison, file.stem)
+        with _as_written(path_of(file), "run icrtool compare again"):
+            comparison = formats.read_document(file, calibration_document.GroupComparison)
+            return pages.comparison_page(comparison, path_of(file).stem)
     if formats.schema_of(source) == calibration_document.CALIBRATION_SCHEMA:
         with _as_written(source, "make it again with icrtool calibrate -o"):
             return pages.calibration_page(formats.open_calibration(source))

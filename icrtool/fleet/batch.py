@@ -18,7 +18,7 @@ from icrtool.config import builtin_robots
 from icrtool.dropout_analysis.report import parse_gate
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
-from icrtool.fleet.one_log import files_of, path_of, row_of_failure
+from icrtool.fleet.one_log import files_of, path_from_bytes, row_of_failure
 from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import (
     FoundRecording,
@@ -35,7 +35,7 @@ from icrtool.logs.containers.source import RemoteFile
 from icrtool.output.files.formats import CHECKSUM_FILE
 from icrtool.output.run_directory import PAGE_FILE, RUN_FILE
 from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
-from icrtool.records.places import UrlPath, read_regular
+from icrtool.records.places import Below, UrlPath, read_regular
 from icrtool.records.requests import BatchRequest, CalibrationInput, LogRequest
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def plan_requests(
     ]
     if baseline is not None and any(gate.relative for gate in gates):
         baseline.check_compares(
-            (one.known.log, _content_of(path_of(one.path), baseline), one.known.robot, one.known.group)
+            (one.known.log, _content_of(path_from_bytes(one.path), baseline), one.known.robot, one.known.group)
             for one in requests
         )
     return requests
@@ -165,10 +165,10 @@ def find_finished_row(request: LogRequest, folder: Path) -> FleetLog | None:
     folder : folder of the results, on disk
     """
     try:
-        row = msgspec.json.decode(read_regular(folder / request.row_file, folder), type=FleetLog)
+        row = msgspec.json.decode(read_regular(Below(folder, request.row_file)), type=FleetLog)
     except (OSError, ValueError):
         return None
-    if row.key != request.known.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
+    if row.key != request.known.key or not row.repeatable or not _same_files(row.inputs, path_from_bytes(request.path)):
         return None
     if row.status != "failed":
         needed = ["run.json", "dropout", CHECKSUM_FILE, *([PAGE_FILE] if request.files.page else [])]
@@ -192,7 +192,7 @@ def run_batch(
     """
     todo: list[LogRequest] = []
     for request in requests:
-        done = find_finished_row(request, folder or path_of(request.folder)) if not batch.redo else None
+        done = find_finished_row(request, folder or path_from_bytes(request.folder)) if not batch.redo else None
         if done is not None:
             yield done
         else:

@@ -26,7 +26,7 @@ from icrtool.output.run_directory import PAGE_FILE, is_page, open_run
 from icrtool.output.text_blocks import Block, Items, Section, Table, Title
 from icrtool.records import fleet_document as documents
 from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog
-from icrtool.records.places import is_regular
+from icrtool.records.places import Below, is_regular
 from icrtool.records.process_resources import remove
 from icrtool.records.rows import FALLBACK_ROW, MAIN_ROW
 from icrtool.records.run import ICR_COLUMNS, Run
@@ -72,8 +72,8 @@ def check_tables(folder: Path, *, page: bool) -> None:
         There is one.
     """
     if page and folder.is_dir():
-        check_place(folder / PAGE_FILE, folder, is_page)
-    stated = formats.schema_of(folder / FLEET_FILE, folder)
+        check_place(Below(folder, PAGE_FILE), is_page)
+    stated = formats.schema_of(Below(folder, FLEET_FILE))
     if stated.startswith(documents.FLEET_FAMILY) or (folder / ROWS).is_dir():
         return
     for file in (*(folder / name for name in TABLES), *pictures_of_batch(folder)):
@@ -141,20 +141,20 @@ def write_fleet(
         They cannot be written to the disk.
     """
     cells = fleet_rows(rows)
-    write_file(directory / "fleet.csv", formats.csv_bytes(cells[0], (row.values() for row in cells)), directory)
+    write_file(Below(directory, "fleet.csv"), formats.csv_bytes(cells[0], (row.values() for row in cells)))
     failures = [[getattr(row, name) for name in FAILURES] for row in rows if row.status == "failed"]
-    write_file(directory / "failures.csv", formats.csv_bytes(FAILURES, failures), directory)
-    with atomic_file(directory / "fleet.parquet", directory) as file:
+    write_file(Below(directory, "failures.csv"), formats.csv_bytes(FAILURES, failures))
+    with atomic_file(Below(directory, "fleet.parquet")) as file:
         _write_parquet(cells, file)
     if plots:
         write_figures(rows, directory, plots)
     document = fleet_document(rows, calibrations)
     # Written after the tables: where it exists, the tables are of the same batch.
-    write_file(directory / FLEET_FILE, formats.json_bytes(document), directory)
+    write_file(Below(directory, FLEET_FILE), formats.json_bytes(document))
     if page:
         from icrtool.output.page.pages import fleet_page
 
-        write_file(directory / PAGE_FILE, fleet_page(document, directory), directory, is_page)
+        write_file(Below(directory, PAGE_FILE), fleet_page(document, directory), is_page)
     return document
 
 
@@ -195,7 +195,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
         if (error := row.errors.get(error_name)) is not None:
             name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, {})[row.log] = error
-    make_folders(folder / PLOTS, folder)
+    make_folders(Below(folder, PLOTS))
     intervals: dict[str, tuple[float, float]] = {}
     for row in rows:
         low, high = (row.errors.get(error_name.replace("_p95_", f"_p95_{end}_")) for end in ("low", "high"))
@@ -205,11 +205,11 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
     numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model, dates, intervals)
     old = set(pictures_of_batch(folder))
     for name, figure in figures_of("fleet", numbers):
-        for file in (folder / PLOTS / f"{name}.{form}" for form in picture_formats):
-            formats.save_picture(figure, file, folder)
-            old.discard(file)
-    for file in old:
-        remove(file)
+        for file in (Below(folder, f"{PLOTS}/{name}.{form}") for form in picture_formats):
+            formats.save_picture(figure, file)
+            old.discard(file.path)
+    for abandoned in old:
+        remove(abandoned)
 
 
 def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
@@ -310,7 +310,7 @@ def pooled_calibrations(
         name = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in text)[:100].strip(".")
         name = unique_name(name or "all", names)
         known = before.get(key)
-        if known is not None and (not known.file or is_regular(directory / known.file, directory)):
+        if known is not None and (not known.file or is_regular(Below(directory, known.file))):
             yield known
         else:
             empty = FleetCalibration(robot, group, tuple(row.log for row in members), key=key)
@@ -338,7 +338,7 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
 
 def is_fleet(directory: Path) -> bool:
     """Return whether a folder is the folder of a batch."""
-    return is_regular(directory / FLEET_FILE, directory)
+    return is_regular(Below(directory, FLEET_FILE))
 
 
 def _pooled(
@@ -366,8 +366,8 @@ def _pooled(
 
     try:
         result = calibrate_runs(usable(), allow_unusable=allow_unusable)
-        make_folders(directory / CALIBRATIONS, directory)
-        formats.write_calibration(result.calibration, directory / file, directory)
+        make_folders(Below(directory, CALIBRATIONS))
+        formats.write_calibration(result.calibration, Below(directory, file))
     except IcrToolError as err:
         left_out = tuple(log for log in one.logs if log not in opened)
         return replace(one, left_out=left_out, reason=str(err))

@@ -21,7 +21,7 @@ from icrtool.output.files.remote_place import write_below
 from icrtool.pipeline import fit_into, report_into
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.fleet_document import FleetFile, FleetLog, fleet_verdict, next_low_name
-from icrtool.records.places import UrlPath, place_of
+from icrtool.records.places import Below, UrlPath, place_of
 from icrtool.records.plain_data import plain
 from icrtool.records.requests import CalibrationInput, LogRequest
 from icrtool.records.run import ICR_COLUMNS
@@ -37,7 +37,7 @@ FLEET_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 """Distances at which a batch collects errors [m]."""
 
 
-def path_of(name: bytes) -> Path:
+def path_from_bytes(name: bytes) -> Path:
     """Return the path that a request holds as bytes."""
     return place_of(os.fsdecode(name))
 
@@ -50,7 +50,7 @@ def process_log(request: LogRequest, watch: Watch) -> FleetLog:
     watch : called with what is done next
     """
     begun = time.monotonic()
-    path, folder = path_of(request.path), path_of(request.folder)
+    path, folder = path_from_bytes(request.path), path_from_bytes(request.folder)
     try:
         row = _results(request, watch)
     except IcrToolError as err:
@@ -73,7 +73,7 @@ def row_of_failure(request: LogRequest, reason: str, *, details: str = "", repea
     """Return the row of a log that could not be processed."""
     inputs: tuple[FleetFile, ...] = ()
     with suppress(OSError):  # a log that was removed meanwhile, or is a device
-        inputs = files_of(path_of(request.path)) if repeatable else ()
+        inputs = files_of(path_from_bytes(request.path)) if repeatable else ()
     return replace(
         request.known, reason=reason, usable=False, details=details, repeatable=repeatable, inputs=inputs,
         tool_version=__version__,
@@ -105,15 +105,15 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
     """Fit and analyse a log, write run and report, and return its row."""
     from icrtool.output.dropout_directory import open_baseline
 
-    path, folder = path_of(request.path), path_of(request.folder)
+    path, folder = path_from_bytes(request.path), path_from_bytes(request.folder)
     asked, files = request.report, request.files
     calibrations = [_calibration_of(one) for one in request.calibrations]
-    with fit_into(folder / request.known.run, path, request.config, asked.fit, files, watch, inside=folder) as found:
+    with fit_into(Below(folder, request.known.run), path, request.config, asked.fit, files, watch) as found:
         run, partial = found
         before = None
         if request.baseline:
             known = request.known
-            before = open_baseline(path_of(request.baseline)).find(
+            before = open_baseline(path_from_bytes(request.baseline)).find(
                 known.log, run.document.content, known.robot, known.group
             )
         report = report_into(partial, run, asked, files, watch, calibrations=calibrations, baseline=before)
@@ -169,7 +169,7 @@ def _calibration_of(given: CalibrationInput) -> Calibration:
     """
     from icrtool.output.files.formats import open_calibration
 
-    file = path_of(given.path)
+    file = path_from_bytes(given.path)
     if file_sha256(file) != given.sha256:
         raise LogChangedError(file, "changed since the batch began", "run the batch again")
     return open_calibration(file)

@@ -27,7 +27,17 @@ from icrtool.output.run_directory import REPORT_FILES, is_run_directory
 from icrtool.records.choices import FigureSet
 from icrtool.records.dropout_document import DropoutDocument, SummaryRow
 from icrtool.records.fleet_document import FLEET_FILE
-from icrtool.records.places import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
+from icrtool.records.places import (
+    NOT_REGULAR,
+    SAVE_IT,
+    Below,
+    Place,
+    below,
+    is_regular,
+    is_special,
+    path_of,
+    read_regular,
+)
 from icrtool.records.rows import IN_CSV
 from icrtool.records.run_document import known_content
 from icrtool.records.stages import Watch, unwatched
@@ -42,13 +52,12 @@ DROPOUT_FAMILY = "icrtool/dropout/"
 
 def write_report(
     analyse: Callable[[ErrorSink | None], DropoutReport],
-    directory: Path,
+    directory: Place,
     *,
     plots: tuple[str, ...] = ("png",),
     figures: FigureSet = "default",
     stamp_ns: Ints | None = None,
     watch: Watch = unwatched,
-    inside: Path | None = None,
 ) -> DropoutReport:
     """Write a report, whole or not at all, in place of an old one; its files are added to the list of its run.
 
@@ -59,30 +68,30 @@ def write_report(
     figures : ``all``: the paper's figures too
     stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: trials are not written
     watch : called with the name of each picture before it is drawn
-    inside : as in `icrtool.output.files.atomic.check_directory`
 
     Raises
     ------
     OutputError
         Something that is not a dropout report is in its place or among its files, or the disk does not take it.
     """
-    with atomic_directory(directory, REPORT, inside) as partial:
+    of_run, name = path_of(directory).parent, path_of(directory).name
+    with atomic_directory(directory, REPORT) as partial:
         with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
             report = analyse(sink)
         if plots:
             figure_catalogue.draw_figures("report", report, partial / "plots", plots, figures, watch)
         write_tables(report, partial)
         names = [path.relative_to(partial).as_posix() for path in sorted(partial.rglob("*")) if path.is_file()]
-        if in_run := is_run_directory(directory.parent):
-            list_anew(directory.parent, directory.name)
+        if in_run := is_run_directory(of_run):
+            list_anew(of_run, name)
     if in_run:
-        list_anew(directory.parent, directory.name, names)
+        list_anew(of_run, name, names)
     return report
 
 
 def is_dropout_directory(directory: Path) -> bool:
     """Return whether a directory is a dropout report of ours."""
-    return schema_of(directory / REPORT_FILE, directory).startswith(DROPOUT_FAMILY)
+    return schema_of(Below(directory, REPORT_FILE)).startswith(DROPOUT_FAMILY)
 
 
 REPORT = Kind(
@@ -198,7 +207,7 @@ class Baseline:
     @property
     def digest(self) -> str:
         """A text that changes with the content."""
-        return sha256(b"".join(read_regular(file, self.folder) for file in self.sources)).hexdigest()
+        return sha256(b"".join(read_regular(below(self.folder, file)) for file in self.sources)).hexdigest()
 
     def missing(self, logs: Iterable[str]) -> list[str]:
         """Return the logs of the baseline that are not among some others, by name."""
@@ -220,10 +229,10 @@ class Baseline:
             The report cannot be read.
         """
         if (found := self.own_report(name, content)) is not None:
-            return read_baseline(self.reports[found], found, self.folder)
+            return read_baseline(below(self.folder, self.reports[found]), found)
         if not (drives := self.drives_of(robot, group)):
             return None
-        pooled = [read_baseline(self.reports[log], log, self.folder).document for log in drives]
+        pooled = [read_baseline(below(self.folder, self.reports[log]), log).document for log in drives]
         return pooled_baseline(pooled, f"{counted(len(drives), 'drive')} of {escaped(robot)}", str(self.path))
 
     def own_report(self, name: str, content: Collection[str]) -> str | None:
@@ -274,10 +283,11 @@ def open_baseline(path: Path) -> Baseline:
     RunError
         The fleet.json of a batch cannot be read.
     """
+    name = f"{DROPOUT_DIRECTORY}/{REPORT_FILE}"
     if not path.is_file() and (path / FLEET_FILE).is_file():
-        logs = {one.log: (path / one.run / DROPOUT_DIRECTORY / REPORT_FILE, one) for one in logs_of_fleet(path)}
-        present = {log: found for log, found in logs.items() if is_regular(found[0], path)}
-        reports = {log: file for log, (file, _) in present.items()}
+        logs = {one.log: (Below(path, f"{one.run}/{name}"), one) for one in logs_of_fleet(path)}
+        present = {log: (report.path, one) for log, (report, one) in logs.items() if is_regular(report)}
+        reports = {log: report for log, (report, _) in present.items()}
         kinds = {log: (one.robot, one.group) for log, (_, one) in present.items() if one.usable}
         files = {log: known_content(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
         sources: tuple[Path, ...] = (path / FLEET_FILE,)
@@ -288,9 +298,8 @@ def open_baseline(path: Path) -> Baseline:
                 raise ConfigError(f"--baseline {path}", NOT_REGULAR, SAVE_IT)
             raise ConfigError(f"--baseline {path}", "no such file or directory", BASELINE_ADVICE)
         one_file = path if path.is_file() else path / REPORT_FILE
-        below = f"**/{DROPOUT_DIRECTORY}/{REPORT_FILE}"
-        for file in [one_file] if one_file.is_file() else sorted(path.glob(below)):
-            one = read_baseline(file, inside=None if file == path else path)
+        for file in [one_file] if one_file.is_file() else sorted(path.glob(f"**/{name}")):
+            one = read_baseline(file if file == path else below(path, file))
             if one.log in reports:
                 why = f"two reports of logs named {one.log}"
                 raise ConfigError(f"--baseline {path}", why, f"{reports[one.log]} and {file}")
@@ -303,21 +312,21 @@ def open_baseline(path: Path) -> Baseline:
     return Baseline(path, reports, files, kinds, sources)
 
 
-def read_baseline(path: Path, log: str = "", inside: Path | None = None) -> BaselineReport:
+def read_baseline(file: Place, log: str = "") -> BaselineReport:
     """Read a report.json as a baseline.
 
     Parameters
     ----------
     log : its name in a batch; default: the name in the report
-    inside : as in `open_regular`
 
     Raises
     ------
     ConfigError
         It is not a dropout report.
     """
+    path = path_of(file)
     try:
-        document = read_document(path, DropoutDocument, inside, escape=False)
+        document = read_document(file, DropoutDocument, escape=False)
         if not document.schema.startswith(DROPOUT_FAMILY):
             raise ValueError(document.schema)
         return BaselineReport(escaped(log or document.run.log), str(path), document)

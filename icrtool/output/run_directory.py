@@ -25,7 +25,18 @@ from icrtool.output.files.atomic import Kind, atomic_directory, check_directory,
 from icrtool.output.files.remote_place import lies_there, on_disk
 from icrtool.output.files.run_columns import MEASUREMENTS_FILE
 from icrtool.records.choices import FigureSet, StatesFormat
-from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_regular, is_special, place_of, read_regular
+from icrtool.records.places import (
+    NOT_REGULAR,
+    SAVE_IT,
+    Below,
+    Place,
+    UrlPath,
+    is_regular,
+    is_special,
+    path_of,
+    place_of,
+    read_regular,
+)
 from icrtool.records.plain_data import Record, plain
 from icrtool.records.requests import FitRequest
 from icrtool.records.run import Run
@@ -57,16 +68,13 @@ RUN_FILES = (
 """Pattern of the names of files in a run directory. A directory with a file of another name is not replaced."""
 
 
-def check_target(
-    directory: Path, log: Path | None = None, *, overwrite: bool = False, inside: Path | None = None
-) -> None:  # fmt: skip
+def check_target(place: Place, log: Path | None = None, *, overwrite: bool = False) -> None:
     """Refuse a place where a run directory cannot be put, before any work is done for it.
 
     Parameters
     ----------
     log : the run will be made from it; a run of another recording is refused
     overwrite : a run of another recording may be replaced
-    inside : as in `check_directory`
 
     Raises
     ------
@@ -76,7 +84,8 @@ def check_target(
     if log is not None and is_run_directory(log):
         path = next((one.path for one in _inputs_of(log)), "data frames")
         raise OutputError(log, "is a run, not a log", f"name its log ({path}), or: icrtool dropout-report {log}")
-    check_directory(directory, RUN, inside)
+    check_directory(place, RUN)
+    directory = path_of(place)
     if log is not None and not overwrite and RUN.is_one(directory) and not _is_made_from(directory, log):
         unknown = "data frames" if is_run_directory(directory) else "its run.json is damaged"
         other = next((one.path for one in _inputs_of(directory)), unknown)
@@ -89,7 +98,7 @@ def _is_made_from(directory: Path, log: Path) -> bool:
     files = [file for file in files_of_log(log) if file.is_file()]
     inputs = _inputs_of(directory)
     try:
-        sources = formats.read_document(directory / formats.SOURCES_FILE, _Sources, directory, escape=False).made_from
+        sources = formats.read_document(Below(directory, formats.SOURCES_FILE), _Sources, escape=False).made_from
     except (OSError, ValueError, RecursionError):
         sources = ()
     if any(os.path.realpath(file) in sources for file in files):
@@ -166,7 +175,7 @@ def _asked_of(directory: Path) -> _Asked | None:
     if isinstance(directory, UrlPath) or not is_run_directory(directory):
         return None
     try:
-        return formats.read_document(directory / RUN_FILE, _Asked, directory, escape=False)
+        return formats.read_document(Below(directory, RUN_FILE), _Asked, escape=False)
     except (OSError, ValueError, RecursionError):
         return None
 
@@ -180,14 +189,13 @@ def write_run(run: Run, directory: Path, **options: Any) -> None:
 @contextmanager
 def new_run(
     run: Run,
-    directory: Path,
+    directory: Place,
     *,
     states: StatesFormat | None = None,
     plots: tuple[str, ...] = ("png",),
     figures: FigureSet = "default",
     note: Callable[[str], None] | None = None,
     watch: Watch = unwatched,
-    inside: Path | None = None,
 ) -> Iterator[Path]:
     """Write a run and give its new directory; at the end of the block the directory is put in its place.
 
@@ -202,7 +210,6 @@ def new_run(
     figures : ``all``: the paper's figures too
     note : called with one line if an old run was replaced and files that the new run does not have were removed
     watch : called with the name of each picture before it is drawn
-    inside : as in `check_directory`
 
     Raises
     ------
@@ -214,10 +221,11 @@ def new_run(
     if states is None:
         states = "csv" if len(run.table) <= MOST_CSV_STATES else "parquet"
         if states != "csv" and note is not None:
-            note(f"{directory}: {len(run.table):,} states: written as states.parquet, not states.csv (--states csv)")
-    with atomic_directory(directory, RUN, inside) as partial, ThreadPoolExecutor(1) as pool:
+            written = f"{len(run.table):,} states: written as states.parquet, not states.csv (--states csv)"
+            note(f"{path_of(directory)}: {written}")
+    with atomic_directory(directory, RUN) as partial, ThreadPoolExecutor(1) as pool:
         # The real path: "." would still name the old run after the old run is renamed.
-        place = Path(os.path.realpath(directory))
+        place = Path(os.path.realpath(path_of(directory)))
         before = set(names_in(place))
         states_written = pool.submit(run_columns.write_states, run.table, partial / f"states.{states}", states)
         if plots:
@@ -236,7 +244,7 @@ def new_run(
     if note is not None and (gone := before.difference(names_in(place))):
         # A folder is listed in place of its files.
         tops = [name for name in sorted(gone) if gone.isdisjoint(f"{one}/" for one in PurePosixPath(name).parents)]
-        note(f"{directory}: replaced: removed {listed(tops, 5)}")
+        note(f"{path_of(directory)}: replaced: removed {listed(tops, 5)}")
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:
@@ -257,7 +265,7 @@ class _Sources(Record, frozen=True):
 def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
     """Return the inputs in a run.json that was not checked."""
     try:
-        return formats.read_document(directory / RUN_FILE, _Inputs, directory, escape=False).inputs
+        return formats.read_document(Below(directory, RUN_FILE), _Inputs, escape=False).inputs
     except (OSError, ValueError, RecursionError):
         return ()
 
@@ -266,13 +274,13 @@ def is_run_directory(directory: Path) -> bool:
     """Return whether a directory, or an address, is a run of ours."""
     if isinstance(directory, UrlPath):
         return lies_there(directory, RUN_FILE)
-    return formats.schema_of(directory / RUN_FILE, directory).startswith(RUN_FAMILY)
+    return formats.schema_of(Below(directory, RUN_FILE)).startswith(RUN_FAMILY)
 
 
 RUN = Kind(
     "run directory",
     # A run with a damaged run.json may be replaced.
-    lambda place: is_run_directory(place) or is_regular(place / formats.SOURCES_FILE, place),
+    lambda place: is_run_directory(place) or is_regular(Below(place, formats.SOURCES_FILE)),
     re.compile(RUN_FILES),
 )
 
@@ -393,7 +401,7 @@ def newest_run(runs: Path) -> Path:
 
 def _read_document(directory: Path) -> dict[str, Any]:
     try:
-        raw = read_regular(directory / RUN_FILE, directory)
+        raw = read_regular(Below(directory, RUN_FILE))
     except (OSError, ValueError) as err:
         if is_special(directory):
             raise RunError(directory, NOT_REGULAR, SAVE_IT) from err
@@ -425,7 +433,7 @@ def _read_states(directory: Path, stem: str, sums: Mapping[str, str], *, whole: 
                 # Both threads read the file from end to end; hashing releases the GIL.
                 checked = pool.submit(check_sum, directory, name, sums)
                 try:
-                    return run_columns.read_states(directory / name, states, directory, whole=whole)
+                    return run_columns.read_states(Below(directory, name), states, whole=whole)
                 finally:
                     checked.result()
     return None
@@ -440,7 +448,7 @@ def check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
         The sums differ, or the file cannot be read.
     """
     try:
-        found = formats.file_b2sum(directory / name, directory)
+        found = formats.file_b2sum(Below(directory, name))
     except OSError as err:
         raise RunError(directory, f"{name} is missing or unreadable ({err.strerror})", FIT_AGAIN) from err
     if found != sums.get(name):

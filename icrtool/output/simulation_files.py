@@ -26,6 +26,7 @@ from icrtool.output.files.atomic import (
 )
 from icrtool.output.files.formats import csv_bytes, json_bytes, read_numbers, schema_of
 from icrtool.records.choices import StudyName
+from icrtool.records.places import Below
 from icrtool.records.process_resources import remove
 from icrtool.simulation.drives import TrackSpeeds, TruthTable
 from icrtool.simulation.study_records import StudyResult
@@ -167,6 +168,6 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
 
 STUDY = Kind(
     "study directory",
-    lambda place: schema_of(place / STUDY_FILE, place).startswith(STUDY_FAMILY),
+    lambda place: schema_of(Below(place, STUDY_FILE)).startswith(STUDY_FAMILY),
     re.compile(rf"study\.json|({'|'.join(get_args(StudyName))})\.(csv|png|svg|pdf)"),
 )

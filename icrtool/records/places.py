@@ -12,8 +12,9 @@ import os
 import re
 import stat
 import sys
+from dataclasses import dataclass
 from io import BufferedReader
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Self
 from urllib.parse import quote, unquote, unquote_plus, urlsplit
 
@@ -55,24 +56,75 @@ class NotRegularFileError(OSError):
         super().__init__(errno.EINVAL, f"{why}{advice}", str(path))
 
 
-def open_regular(path: Path, inside: Path | None = None) -> BufferedReader:
-    """Open a regular file for reading; never wait for a pipe or a device.
+@dataclass(frozen=True, slots=True)
+class Below:
+    """A file or a folder below a folder, where it is read or written without following a link below that folder.
 
-    Parameters
+    Attributes
     ----------
-    inside : a directory above the file; below it no link is followed. None: links are followed, because the user named
-        the file
+    folder : links above it are followed, because the user named it
+    name : path from the folder
+    """
+
+    folder: Path
+    name: str | PurePath
+
+    @property
+    def path(self) -> Path:
+        """The whole path."""
+        return self.folder / self.name
+
+    def check_links(self) -> None:
+        """Refuse a path that is a link or leads over one.
+
+        Raises
+        ------
+        NotRegularFileError
+            It does, or does not lie below the folder.
+        """
+        above, parts = self.folder, PurePath(self.name).parts
+        if ".." in parts or PurePath(self.name).is_absolute():
+            raise NotRegularFileError(self.path, f"does not lie in {self.folder}")
+        for part in parts:
+            above = above / part
+            if above.is_symlink():
+                raise NotRegularFileError(above, f"{part} is a link, which is not followed")
+
+
+Place = Path | Below
+"""A path that the user named, whose links are followed, or a path below a folder, where no link is followed."""
+
+
+def path_of(place: Place) -> Path:
+    """Return the path of a place."""
+    return place.path if isinstance(place, Below) else place
+
+
+def below(folder: Path | None, path: Path) -> Place:
+    """Return a path as one below a folder; the path itself where the folder is None, because the user named the path.
+
+    Raises
+    ------
+    ValueError
+        It does not begin with the folder.
+    """
+    return path if folder is None else Below(folder, path.relative_to(folder))
+
+
+def open_regular(place: Place) -> BufferedReader:
+    """Open a regular file for reading; never wait for a pipe or a device.
 
     Raises
     ------
     NotRegularFileError
-        It is a link, a pipe, a device or a directory, or a directory above it is a link.
+        It is a pipe, a device or a directory; below a folder, a link, or a directory above it is a link.
     OSError
         It cannot be opened.
     """
-    if inside is not None:
-        check_links(path, inside)
-    handle = os.open(path, _FILE if inside is None else _FILE | _NO_LINK)
+    if isinstance(place, Below):
+        place.check_links()
+    path = path_of(place)
+    handle = os.open(path, _FILE | _NO_LINK if isinstance(place, Below) else _FILE)
     try:
         mode = os.fstat(handle).st_mode
         if stat.S_ISDIR(mode):
@@ -85,7 +137,7 @@ def open_regular(path: Path, inside: Path | None = None) -> BufferedReader:
         raise
 
 
-def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGEST_DOCUMENT_BYTES) -> bytes:
+def read_regular(place: Place, most_bytes: int = LARGEST_DOCUMENT_BYTES) -> bytes:
     """Return the content of a file that `open_regular` opens.
 
     Raises
@@ -93,7 +145,7 @@ def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGE
     OSError
         As `open_regular`; the file is larger than `most_bytes`.
     """
-    with open_regular(path, inside) as file:
+    with open_regular(place) as file:
         # the size of the file, not the limit: this is the memory that is allocated; a sparse file is refused unread
         size = os.fstat(file.fileno()).st_size
         content = file.read(size + 1) if size <= most_bytes else b""
@@ -102,7 +154,7 @@ def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGE
         ):
             content += more
     if max(size, len(content)) > most_bytes:
-        raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
+        raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path_of(place)))
     return content
 
 
@@ -115,30 +167,13 @@ def is_special(path: Path) -> bool:
     return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
-def is_regular(path: Path, inside: Path) -> bool:
+def is_regular(place: Place) -> bool:
     """Return whether there is a file that `open_regular` opens."""
     try:
-        open_regular(path, inside).close()
+        open_regular(place).close()
     except (OSError, ValueError):  # ValueError: what a stranger wrote is no path
         return False
     return True
-
-
-def check_links(path: Path, inside: Path) -> None:
-    """Refuse a path, of a file or a folder below a directory, that is a link or leads over one.
-
-    Raises
-    ------
-    NotRegularFileError
-        It does, or does not lie there.
-    """
-    place, names = inside, path.relative_to(inside).parts
-    if ".." in names:
-        raise NotRegularFileError(path, f"does not lie in {inside}")
-    for name in names:
-        place = place / name
-        if place.is_symlink():
-            raise NotRegularFileError(place, f"{name} is a link, which is not followed")
 
 
 class UrlPath(_LocalPath):

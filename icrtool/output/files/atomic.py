@@ -19,12 +19,12 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from hashlib import blake2b
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import NamedTuple
 from zlib import crc32
 
 from icrtool.errors import OutputError
-from icrtool.records.places import check_links, open_regular
+from icrtool.records.places import Below, Place, open_regular, path_of
 from icrtool.records.process_resources import begin, end, remove, unfinished
 
 IsOurFile = Callable[[bytes], bool]
@@ -76,38 +76,40 @@ class Kind(NamedTuple):
 
 
 @contextmanager
-def place_errors(path: Path) -> Iterator[None]:
+def place_errors(place: Place) -> Iterator[None]:
     """Raise an OSError of the block as an OutputError of a place."""
     try:
         yield
     except OSError as err:
-        raise OutputError(path, "cannot be written", err.strerror or str(err)) from err
+        raise OutputError(path_of(place), "cannot be written", err.strerror or str(err)) from err
 
 
-def check_place(path: Path, inside: Path | None = None, ours: IsOurFile | None = None) -> None:
+def check_place(file: Place, ours: IsOurFile | None = None) -> None:
     """Refuse a place where a file cannot be put, before any work is done for it.
 
     Parameters
     ----------
-    inside, ours : as in `atomic_file`
+    ours : as in `atomic_file`
 
     Raises
     ------
     OutputError
-        The directory is missing, or is a link below `inside`; a log, a directory, a device, a pipe or a file that
+        The directory is missing, or is a link below the folder; a log, a directory, a device, a pipe or a file that
         icrtool did not write is there.
     """
-    with place_errors(path):
-        if not _place_of_file(path, inside, ours).parent.is_dir():
-            raise OutputError(path, "its directory does not exist", "make it first, or name another file")
+    with place_errors(file):
+        if not _target_of(file, ours).parent.is_dir():
+            raise OutputError(path_of(file), "its directory does not exist", "make it first, or name another file")
 
 
-def _place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> Path:
-    """Return the place of a file without links; parameters and errors as in `check_place`."""
-    place = Path(os.path.realpath(path if inside is None else path.parent))
-    if inside is not None:
-        check_links(path.parent, inside)
-        place /= path.name
+def _target_of(file: Place, ours: IsOurFile | None) -> Path:
+    """Return the path of a file without links; parameters and errors as in `check_place`."""
+    path = path_of(file)
+    if isinstance(file, Below):
+        Below(file.folder, PurePath(file.name).parent).check_links()
+        place = Path(os.path.realpath(path.parent)) / path.name
+    else:
+        place = Path(os.path.realpath(path))
     if place.is_dir():
         raise OutputError(path, "is a directory", "name a file")
     if place.is_symlink() or not place.exists():
@@ -127,14 +129,13 @@ def _place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> P
 
 
 @contextmanager
-def atomic_file(file: Path, inside: Path | None = None, ours: IsOurFile | None = None) -> Iterator[Path]:
+def atomic_file(file: Place, ours: IsOurFile | None = None) -> Iterator[Path]:
     """Give a hidden path in the folder of a file to write to; at the block's end it is synced and moved to its place.
 
     Parameters
     ----------
-    file : where it shall appear; a log is never replaced
-    inside : a directory above the file. Below it no link is followed; a link in the file's place is replaced.
-        None: the user named this file. A link in its place is kept, and its target is replaced
+    file : where it shall appear; a log is never replaced. Below a folder, a link in its place is replaced; where the
+        user named the file, the link is kept and its target is replaced
     ours : which files may be replaced; default: any file that is not a log
 
     Raises
@@ -142,30 +143,30 @@ def atomic_file(file: Path, inside: Path | None = None, ours: IsOurFile | None =
     OutputError
         As `check_place`, and for every OSError of the block (disk full, no permission). The old file is then unchanged.
     """
-    with place_errors(file), partial_at(_place_of_file(file, inside, ours), Path.touch) as partial:
+    with place_errors(file), partial_at(_target_of(file, ours), Path.touch) as partial:
         yield partial
         sync(partial)
-        put(partial, _place_of_file(file, inside, ours))
+        put(partial, _target_of(file, ours))
 
 
-def write_file(file: Path, content: str | bytes, inside: Path | None = None, ours: IsOurFile | None = None) -> None:
+def write_file(file: Place, content: str | bytes, ours: IsOurFile | None = None) -> None:
     """Write a file, whole or not at all; a text is written in UTF-8, with escapes for invalid characters.
 
     Parameters
     ----------
-    inside, ours : as in `atomic_file`
+    ours : as in `atomic_file`
 
     Raises
     ------
     OutputError
         As `atomic_file`.
     """
-    with atomic_file(file, inside, ours) as partial:
+    with atomic_file(file, ours) as partial:
         partial.write_bytes(content.encode("utf-8", errors="backslashreplace") if isinstance(content, str) else content)
 
 
-def make_folders(folder: Path, inside: Path) -> None:
-    """Make a folder below a directory, and the folders between, if they do not exist; no link is followed.
+def make_folders(folder: Below) -> None:
+    """Make a folder, and the folders between, if they do not exist; no link is followed.
 
     Raises
     ------
@@ -173,18 +174,16 @@ def make_folders(folder: Path, inside: Path) -> None:
         A link or a file is in its place, or it cannot be made.
     """
     with place_errors(folder):
-        check_links(folder, inside)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.check_links()
+        folder.path.mkdir(parents=True, exist_ok=True)
 
 
-def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> None:
+def check_directory(directory: Place, kind: Kind) -> None:
     """Refuse a place where a directory of a kind cannot be put; restore an old one that a killed process renamed.
 
     Parameters
     ----------
     directory : where it shall appear; only an empty directory, or one of the kind without other files, may be there
-    inside : a directory above it, below which no link is followed. None: links are followed, because the user named the
-        path
 
     Raises
     ------
@@ -194,10 +193,10 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
     """
     why, advice = "", "it is left alone; name another place"
     with place_errors(directory):
-        if inside is not None:
-            check_links(directory, inside)
+        if isinstance(directory, Below):
+            directory.check_links()
         # Unlike `Path.resolve`, this does not fail on a link to itself.
-        place = Path(os.path.realpath(directory))
+        place = Path(os.path.realpath(path_of(directory)))
         aside = [path for path in place.parent.glob(_hidden_name(place, "*", OLD_SUFFIX)) if not path.is_symlink()]
         if aside and not os.path.lexists(place):
             max(aside, key=lambda path: path.stat().st_mtime_ns).rename(place)
@@ -220,7 +219,7 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
         if not why and place.is_mount():
             why, advice = "is a mount point, which cannot be replaced", "name a directory in it"
     if why:
-        raise OutputError(directory, why, advice)
+        raise OutputError(path_of(directory), why, advice)
 
 
 def names_in(directory: Path) -> Iterator[str]:
@@ -247,12 +246,12 @@ def names_in(directory: Path) -> Iterator[str]:
 
 
 @contextmanager
-def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) -> Iterator[Path]:
+def atomic_directory(directory: Place, kind: Kind) -> Iterator[Path]:
     """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
 
     Parameters
     ----------
-    directory, kind, inside : as in `check_directory`
+    directory, kind : as in `check_directory`
 
     Yields
     ------
@@ -264,14 +263,14 @@ def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) ->
     OutputError
         As `check_directory`, and for every OSError of the block (disk full, no permission).
     """
-    check_directory(directory, kind, inside)
-    place = Path(os.path.realpath(directory))
+    check_directory(directory, kind)
+    place = Path(os.path.realpath(path_of(directory)))
     with place_errors(directory):
         place.parent.mkdir(parents=True, exist_ok=True)
         with partial_at(place, Path.mkdir) as partial:
             yield partial
             sync_tree(partial)
-            check_directory(directory, kind, inside)
+            check_directory(directory, kind)
             put(partial, place)
 
 

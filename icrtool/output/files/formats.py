@@ -24,7 +24,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.output.files.atomic import check_place, write_file
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationFile
 from icrtool.records.fleet_document import FLEET_FILE, FleetDocument, FleetLog
-from icrtool.records.places import check_links, open_regular, read_regular
+from icrtool.records.places import Below, Place, open_regular, path_of, read_regular
 from icrtool.records.plain_data import plain
 from icrtool.records.text import LogText, escaped_texts, table_cell
 
@@ -34,15 +34,10 @@ if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
 
 
-def schema_of(file: Path, inside: Path | None = None) -> str:
-    """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty where it states none.
-
-    Parameters
-    ----------
-    inside : as in `open_regular`
-    """
+def schema_of(file: Place) -> str:
+    """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty where it states none."""
     try:
-        schema = json.loads(read_regular(file, inside))["schema"]
+        schema = json.loads(read_regular(file))["schema"]
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return ""
     return schema if isinstance(schema, str) else ""
@@ -69,12 +64,11 @@ def _finite(text: str) -> float:
 Document = TypeVar("Document", bound=msgspec.Struct)
 
 
-def read_document(file: Path, kind: type[Document], inside: Path | None = None, *, escape: bool = True) -> Document:
+def read_document(file: Place, kind: type[Document], *, escape: bool = True) -> Document:
     """Read a JSON file as a record: types and limits are checked, keys that it does not know are ignored.
 
     Parameters
     ----------
-    inside : as in `open_regular`
     escape : escape the texts, because they are printed later; names of files are not escaped
 
     Raises
@@ -82,7 +76,7 @@ def read_document(file: Path, kind: type[Document], inside: Path | None = None, 
     OSError, ValueError, RecursionError
         The file cannot be read, or does not agree with the record.
     """
-    stored = parse_json(read_regular(file, inside))
+    stored = parse_json(read_regular(file))
     return msgspec.convert(escaped_texts(stored) if escape else stored, kind)
 
 
@@ -162,22 +156,18 @@ def check_picture(file: Path) -> None:
     check_place(file)
 
 
-def save_picture(figure: Figure, file: Path, inside: Path | None = None) -> None:
+def save_picture(figure: Figure, file: Place) -> None:
     """Write a figure; the suffix gives the format.
-
-    Parameters
-    ----------
-    inside : as in `icrtool.output.files.atomic.atomic_file`
 
     Raises
     ------
     OutputError
         The file cannot be written.
     """
-    form = file.suffix.removeprefix(".").lower()
+    form = path_of(file).suffix.removeprefix(".").lower()
     from icrtool.output.figures.style import picture_bytes
 
-    write_file(file, picture_bytes(figure, form), inside)
+    write_file(file, picture_bytes(figure, form))
 
 
 CHECKSUM_FILE = "B2SUMS"
@@ -198,21 +188,17 @@ LARGEST_RUN_FILE_BYTES = 1 << 33
 hours to read."""
 
 
-def file_b2sum(path: Path, inside: Path | None = None) -> str:
+def file_b2sum(place: Place) -> str:
     """Return the BLAKE2b sum (hex) of a file: as safe as SHA-256, at twice its speed on most machines.
-
-    Parameters
-    ----------
-    inside : as in `open_regular`
 
     Raises
     ------
     OSError
         The file cannot be read, or is larger than `LARGEST_RUN_FILE_BYTES`.
     """
-    with open_regular(path, inside) as file:
+    with open_regular(place) as file:
         if os.fstat(file.fileno()).st_size > LARGEST_RUN_FILE_BYTES:
-            raise OSError(errno.EFBIG, f"larger than {LARGEST_RUN_FILE_BYTES} bytes", str(path))
+            raise OSError(errno.EFBIG, f"larger than {LARGEST_RUN_FILE_BYTES} bytes", str(path_of(place)))
         return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
 
 
@@ -225,7 +211,7 @@ def read_sums(directory: Path) -> dict[str, str]:
         The list of sums cannot be read.
     """
     try:
-        lines = read_regular(directory / CHECKSUM_FILE, directory, LARGEST_SUMS_BYTES).decode().splitlines()
+        lines = read_regular(Below(directory, CHECKSUM_FILE), LARGEST_SUMS_BYTES).decode().splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise RunError(directory, f"no readable {CHECKSUM_FILE}", "fit the log again") from err
     return {name: sum_ for sum_, _, name in (line.partition("  ") for line in lines)}
@@ -239,7 +225,8 @@ def write_sums(directory: Path, sums: Mapping[str, str]) -> None:
     OutputError
         The disk does not take it.
     """
-    write_file(directory / CHECKSUM_FILE, "".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()), directory)
+    lines = (f"{sum_}  {name}\n" for name, sum_ in sums.items())
+    write_file(Below(directory, CHECKSUM_FILE), "".join(lines))
 
 
 def list_anew(directory: Path, part: str, names: Iterable[str] = ()) -> None:
@@ -254,7 +241,7 @@ def list_anew(directory: Path, part: str, names: Iterable[str] = ()) -> None:
         return
     before = read_sums(directory)
     sums = {name: sum_ for name, sum_ in before.items() if not name.startswith(f"{part}/")}
-    sums |= {f"{part}/{name}": file_b2sum(directory / part / name, directory) for name in names}
+    sums |= {f"{part}/{name}": file_b2sum(Below(directory, f"{part}/{name}")) for name in names}
     if sums != before:
         write_sums(directory, sums)
 
@@ -286,12 +273,8 @@ def open_calibration(file: Path | str) -> Calibration:
         raise RunError(path, why, "make one with icrtool calibrate -o") from err
 
 
-def write_calibration(document: CalibrationFile, place: Path, inside: Path | None = None) -> Path:
+def write_calibration(document: CalibrationFile, place: Place) -> Path:
     """Write a calibration file: into `place` where that is a folder, else as `place`.
-
-    Parameters
-    ----------
-    inside : as in `atomic_file`
 
     Returns
     -------
@@ -303,30 +286,27 @@ def write_calibration(document: CalibrationFile, place: Path, inside: Path | Non
     OutputError
         Something that is not a calibration is there, or it cannot be written.
     """
-    file = calibration_file(place, inside)
-    write_file(file, json_bytes(document), place if file != place else inside)
-    return file
+    file = calibration_file(place)
+    write_file(file, json_bytes(document))
+    return path_of(file)
 
 
-def calibration_file(place: Path, inside: Path | None = None) -> Path:
-    """Return the path of the calibration file that is written for `place`.
-
-    Parameters
-    ----------
-    inside : as in `write_calibration`
+def calibration_file(place: Place) -> Place:
+    """Return where the calibration file is written for `place`: in this folder, else `place` itself.
 
     Raises
     ------
     OutputError
         Its folder does not exist, or something that is not a calibration is there.
     """
-    file = place / CALIBRATION_FILE if place.is_dir() else place
+    found = Below(path_of(place), CALIBRATION_FILE) if path_of(place).is_dir() else place
+    file = path_of(found)
     if not file.parent.is_dir():
         raise OutputError(file, f"there is no folder {file.parent}", "make it, or name another place")
-    replaced = file.is_symlink() and (file != place or inside is not None)
+    replaced = file.is_symlink() and isinstance(found, Below)
     if file.exists() and not replaced and schema_of(file) != CALIBRATION_SCHEMA:
         raise OutputError(file, "a file that is not a calibration is there", "it is left alone; name another place")
-    return file
+    return found
 
 
 def read_fleet(directory: Path) -> FleetDocument:
@@ -337,7 +317,7 @@ def read_fleet(directory: Path) -> FleetDocument:
     OSError, ValueError, RecursionError
         It cannot be read, or is not of this version.
     """
-    return read_document(directory / FLEET_FILE, FleetDocument, directory, escape=False)
+    return read_document(Below(directory, FLEET_FILE), FleetDocument, escape=False)
 
 
 def logs_of_fleet(directory: Path) -> list[FleetLog]:
@@ -351,7 +331,7 @@ def logs_of_fleet(directory: Path) -> list[FleetLog]:
     try:
         found = [one for one in read_fleet(directory).logs if one.status != "failed"]
         for one in found:
-            check_links(directory / one.run, directory)
+            Below(directory, one.run).check_links()
     except (OSError, ValueError, RecursionError) as err:
         raise RunError(directory, f"its {FLEET_FILE} cannot be read ({err})", "name the folder of a batch") from err
     return found

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, NoReturn, TypeVar
 
 from icrtool.errors import IcrToolError, LogError, OutputError
@@ -23,7 +23,7 @@ from icrtool.logs.containers.unpack import ScratchFolder
 from icrtool.output.files.atomic import ABANDONED_S, has_process, make_folders, place_errors, write_file, writer
 from icrtool.output.files.formats import CHECKSUM_FILE, SOURCES_FILE
 from icrtool.records.fleet_document import FLEET_FILE
-from icrtool.records.places import UrlPath
+from icrtool.records.places import Below, UrlPath
 
 Result = TypeVar("Result")
 
@@ -116,8 +116,8 @@ def write_below(folder: Path, name: str, content: bytes) -> None:
     if isinstance(file, UrlPath):
         _Store(file).put(content)
         return
-    make_folders(file.parent, folder)
-    write_file(file, content, folder)
+    make_folders(Below(folder, PurePath(name).parent))
+    write_file(Below(folder, name), content)
 
 
 def lies_there(place: UrlPath, name: str) -> bool:

@@ -27,7 +27,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.chunk import LARGEST_RATIO
 from icrtool.records.choices import StatesFormat
 from icrtool.records.measurements import Fixes, ReferenceJump, SensorData, SlipEvent
-from icrtool.records.places import open_regular
+from icrtool.records.places import Below, Place, open_regular, path_of
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, thin
@@ -97,12 +97,11 @@ def write_states(table: States, path: Path, states: StatesFormat) -> None:
             file.writelines(_csv_chunks(table))
 
 
-def read_states(path: Path, states: StatesFormat, inside: Path | None = None, *, whole: bool = True) -> States:
+def read_states(place: Place, states: StatesFormat, *, whole: bool = True) -> States:
     """Read states that `write_states` wrote.
 
     Parameters
     ----------
-    inside : as in `open_regular`
     whole : hold the standard deviations, too; otherwise, with Parquet, they are read where they are used
 
     Raises
@@ -119,7 +118,7 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None, *,
         if states == "parquet":
             import pyarrow.parquet as pq
 
-            with open_regular(path, inside) as source, pq.ParquetFile(source) as file:
+            with open_regular(place) as source, pq.ParquetFile(source) as file:
                 numbers = file.metadata.num_rows * len(COLUMNS_OF_STATES)
                 if 8 * numbers > FREE_STATES_BYTES + LARGEST_RATIO * os.fstat(source.fileno()).st_size:
                     raise ValueError(f"it claims {numbers} numbers, too many for its size")
@@ -127,13 +126,13 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None, *,
                 held = {
                     name: _parquet_column(file, name) for name in COLUMNS_OF_STATES if whole or name not in DEVIATIONS
                 }
-                read = partial(_read_again, path, inside, _identity(source))
+                read = partial(_read_again, place, _identity(source))
             pa.default_memory_pool().release_unused()
             return States(**held) if whole else StoredStates(read, **held)
         import pyarrow.csv as pc
 
         options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS_OF_STATES), null_values=[])
-        with open_regular(path, inside) as source:
+        with open_regular(place) as source:
             stored = pc.read_csv(source, convert_options=options)
         _check_columns(stored.schema, types)
         columns = dict(zip(stored.schema.names, stored.columns, strict=True))
@@ -177,7 +176,7 @@ def _identity(file: BufferedReader) -> tuple[int, ...]:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def _read_again(path: Path, inside: Path | None, identity: tuple[int, ...], name: str) -> Floats:
+def _read_again(place: Place, identity: tuple[int, ...], name: str) -> Floats:
     """Return a column of states that were read before.
 
     Raises
@@ -188,8 +187,9 @@ def _read_again(path: Path, inside: Path | None, identity: tuple[int, ...], name
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    path = path_of(place)
     try:
-        with open_regular(path, inside) as source:
+        with open_regular(place) as source:
             if _identity(source) != identity:
                 raise RunError(path.parent, f"{path.name} was replaced or edited while it was in use", "start again")
             with pq.ParquetFile(source) as file:
@@ -303,7 +303,7 @@ def read_measurements(
         The file cannot be read.
     """
     try:
-        with open_regular(directory / MEASUREMENTS_FILE, directory) as file, ZipFile(file) as stored:
+        with open_regular(Below(directory, MEASUREMENTS_FILE)) as file, ZipFile(file) as stored:
             if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
                 raise ValueError(f"{MEASUREMENTS_FILE} is compressed")  # its size would have no bound
             columns = {}

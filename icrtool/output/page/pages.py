@@ -60,7 +60,7 @@ from icrtool.records.calibration_document import ErrorsAt, GroupComparison
 from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog, next_low_name
 from icrtool.records.notes import is_grave, warnings_of
-from icrtool.records.places import is_regular
+from icrtool.records.places import Below, Place, is_regular
 from icrtool.records.rows import FALLBACK_ROW, IN_CSV, MAIN_ROW, rows_of, shown_rows
 from icrtool.records.run import ICR_WORDS, Run, check_type
 from icrtool.records.run_document import RunDocument
@@ -72,19 +72,17 @@ SCRIPTS = (*VENDOR, "columns.js", "open_loop.js", "charts.js", "map.js", "run.js
 
 
 def write_page(
-    run: Run, report: DropoutReport, path: str | Path, *, plots: Path | None = None, coordinates: bool = True,
-    inside: Path | None = None,
-) -> None:  # fmt: skip
+    run: Run, report: DropoutReport, path: str | Place, *, plots: Path | None = None, coordinates: bool = True
+) -> None:
     """Write a run and its dropout report as one HTML file.
 
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
     report : of `icrtool.dropout_report`
-    path : the file
+    path : the file; below a folder, only a page is replaced
     plots : directory of the run, whose PNG pictures the page shows where no script draws; default: `run.directory`
     coordinates : False leaves out where on the globe the robot was
-    inside : as in `icrtool.output.files.atomic.atomic_file`
 
     Raises
     ------
@@ -94,7 +92,8 @@ def write_page(
     check_type(run, Run, "icrtool.open_run(directory) reads one")
     pictures = pictures_of_run(plots if plots is not None else run.directory)
     page = run_page(run, report.document, pictures, coordinates=coordinates)
-    write_file(Path(path), page, inside, ours=is_page if inside is not None else None)
+    file = Path(path) if isinstance(path, str) else path
+    write_file(file, page, ours=is_page if isinstance(file, Below) else None)
 
 
 def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture], *, coordinates: bool = True) -> str:
@@ -223,10 +222,10 @@ def read_report(directory: Path) -> DropoutDocument | None:
         return None
     if name in (sums := _listed(directory)):
         check_sum(directory, name, sums)
-    if schema_of(file, directory) != DROPOUT_SCHEMA:
+    if schema_of(Below(directory, name)) != DROPOUT_SCHEMA:
         raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
     try:
-        return read_document(file, DropoutDocument, directory)
+        return read_document(Below(directory, name), DropoutDocument)
     except (ValueError, RecursionError) as err:
         why = f"is not as this version of icrtool writes it ({err})"
         raise RunError(file, why, "make it again with icrtool dropout-report") from err
@@ -237,8 +236,9 @@ def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
     if directory is None:
         return {}
     sums = _listed(directory)
-    places = (directory / "plots", directory / DROPOUT_DIRECTORY / "plots")
-    return {name: one for place in places for name, one in pictures_in(place, directory, sums).items()}
+    return pictures_in(Below(directory, "plots"), sums) | pictures_in(
+        Below(directory, f"{DROPOUT_DIRECTORY}/plots"), sums
+    )
 
 
 def _listed(directory: Path) -> dict[str, str]:
@@ -298,7 +298,7 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
     # Reasons without details of a single log: the first part of ``why; advice``.
     reasons = Counter(log.reason.split(";")[0].split(" (tried")[0] for log in logs if log.status == "failed")
     why = Table("lr", [(reason, f"{count}") for reason, count in reasons.most_common()], ("reason", "logs"))
-    pictures = pictures_in(folder / "plots", folder)
+    pictures = pictures_in(Below(folder, "plots"))
     blocks: list[Block] = [
         Title(title, about),
         Section("Each robot, from all its logs together", [_robots_table(document.calibrations)], name="robots"),
@@ -353,7 +353,7 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
         names = [getattr(log, key) for key in named]
         page = PurePosixPath(log.run) / PAGE_FILE
         # No link to a page that does not exist or lies outside the folder.
-        link = "" if page.is_absolute() or not is_regular(folder / page, folder) else f"./{quote(str(page))}"
+        link = "" if page.is_absolute() or not is_regular(Below(folder, page)) else f"./{quote(str(page))}"
         numbers = [log.reason] if log.status == "failed" else columns.values()
         rows.append([Cell(log.log, link=link), status, *names, *numbers])
         words = (log.log, log.status, log.robot, log.group, log.reason, *log.tags)
@@ -510,8 +510,9 @@ def _row_of_errors(name: str, one: ErrorsAt, sign: str) -> tuple[str, str, str]:
     return name, f"{one.p95_m:{sign}z.2f} m", interval
 
 
-def comparison_in(place: Path) -> Path | None:
+def comparison_in(place: Path) -> Place | None:
     """Return the file of a comparison: `place` itself, or the first one in this folder; None where there is none."""
-    inside = place if place.is_dir() else None
-    files = [place] if inside is None else sorted(place.glob("*.json"))
-    return next((file for file in files if schema_of(file, inside).startswith(COMPARISON_FAMILY)), None)
+    files: list[Place] = [place]
+    if place.is_dir():
+        files = [Below(place, file.name) for file in sorted(place.glob("*.json"))]
+    return next((file for file in files if schema_of(file).startswith(COMPARISON_FAMILY)), None)

@@ -9,13 +9,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from hashlib import blake2b, sha256
 from importlib.resources import files
-from pathlib import Path
+from pathlib import PurePath
 from typing import TYPE_CHECKING, NamedTuple
 
 from icrtool import __version__
 from icrtool.errors import RunError
 from icrtool.output.text_blocks import Block, stated
-from icrtool.records.places import read_regular
+from icrtool.records.places import Below, read_regular
 from icrtool.records.plain_data import plain
 from icrtool.records.text import escaped
 
@@ -158,13 +158,12 @@ def drawn_pictures(figures: Iterable[tuple[str, Figure]]) -> dict[str, Picture]:
     return pictures_of((name, picture_bytes(figure, "png")) for name, figure in figures)
 
 
-def pictures_in(directory: Path, inside: Path, sums: Mapping[str, str] | None = None) -> dict[str, Picture]:
+def pictures_in(directory: Below, sums: Mapping[str, str] | None = None) -> dict[str, Picture]:
     """Return the PNG pictures of a folder that this module knows, by name; none where the folder is not there.
 
     Parameters
     ----------
-    inside : the directory that the user named; below it no link is followed
-    sums : BLAKE2b sums (hex) of files by their path below it, where they are known
+    sums : BLAKE2b sums (hex) of files by their path from `directory.folder`, where they are known
 
     Raises
     ------
@@ -173,20 +172,24 @@ def pictures_in(directory: Path, inside: Path, sums: Mapping[str, str] | None = 
     """
     from icrtool.output.figure_catalogue import entry_of
 
-    files = (file for file in sorted(directory.glob("*.png")) if PICTURE.fullmatch(file.stem) and entry_of(file.stem))
-    return pictures_of((file.stem, _png(file, inside, sums or {})) for file in files)
+    stems = [file.stem for file in sorted(directory.path.glob("*.png"))]
+    return pictures_of(
+        (stem, _png(Below(directory.folder, f"{directory.name}/{stem}.png"), sums or {}))
+        for stem in stems
+        if PICTURE.fullmatch(stem) and entry_of(stem)
+    )
 
 
-def _png(file: Path, inside: Path, sums: Mapping[str, str]) -> bytes:
-    name = file.relative_to(inside).as_posix()
+def _png(file: Below, sums: Mapping[str, str]) -> bytes:
+    name = PurePath(file.name).as_posix()
     try:
-        content = read_regular(file, inside, LARGEST_PICTURE_BYTES)
+        content = read_regular(file, LARGEST_PICTURE_BYTES)
     except OSError as err:
-        raise RunError(inside, f"{name} cannot be read ({err.strerror})", "remove it") from err
+        raise RunError(file.folder, f"{name} cannot be read ({err.strerror})", "remove it") from err
     if not content.startswith(SIGNATURE):
-        raise RunError(inside, f"{name} is not a PNG picture", "remove it")
+        raise RunError(file.folder, f"{name} is not a PNG picture", "remove it")
     if sums.get(name, found := blake2b(content).hexdigest()) != found:
-        raise RunError(inside, f"{name} was edited or cut short since the run", "remove it, or fit the log again")
+        raise RunError(file.folder, f"{name} was edited or cut short since the run", "remove it, or fit the log again")
     return content
 
 

@@ -33,7 +33,7 @@ from icrtool.fleet import one_log, processes
 
 def results(request, stage):
     stage("reading")
-    path = one_log.path_of(request.path)
+    path = one_log.path_from_bytes(request.path)
     with open(path.parent / "order.txt", "a", errors="surrogateescape") as order:
         order.write(path.stem + chr(10))
     if "hang" in path.stem:
@@ -49,7 +49,7 @@ def results(request, stage):
     if "bad" in path.stem:
         raise DataError(path.name, "no wheels")
     time.sleep(0.3 if "slow" in path.stem else 0)
-    directory = one_log.path_of(request.folder) / request.known.run
+    directory = one_log.path_from_bytes(request.folder) / request.known.run
     (directory / "dropout").mkdir(parents=True, exist_ok=True)
     (directory / "run.json").write_text("{}")
     (directory / "B2SUMS").touch()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.records.places import NotRegularFileError, check_links, is_regular, read_regular
+from icrtool.records.places import Below, NotRegularFileError, is_regular, read_regular
 
 
 @pytest.fixture
@@ -24,14 +24,14 @@ def place(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["file", "inner/file"])
 def test_a_regular_file_below_a_directory_is_read(place: Path, name: str) -> None:
-    assert read_regular(place / name, place) == f"place/{name}".encode()
+    assert read_regular(Below(place, name)) == f"place/{name}".encode()
 
 
 @pytest.mark.parametrize("name", ["link", "out", "out/file", "pipe", "inner", "inner/../file", "../outside/file"])
 def test_no_link_pipe_or_folder_is_read_below_a_directory(place: Path, name: str) -> None:
     with pytest.raises(OSError, match=r"link|regular|[Dd]irectory|does not lie"):
-        read_regular(place / name, place)
-    assert not is_regular(place / name, place)
+        read_regular(Below(place, name))
+    assert not is_regular(Below(place, name))
 
 
 def test_a_directory_that_the_user_names_for_a_file_is_stated_to_be_one(place: Path) -> None:
@@ -48,18 +48,18 @@ def test_a_file_that_the_user_names_may_be_a_link_and_no_pipe(place: Path) -> No
 
 
 def test_a_directory_that_is_named_may_be_a_link(place: Path) -> None:
-    assert read_regular(place / "out" / "file", place / "out") == b"outside/file"
+    assert read_regular(Below(place / "out", "file")) == b"outside/file"
 
 
 def test_a_file_that_is_too_large_is_not_read(place: Path) -> None:
-    assert read_regular(place / "file", place, most_bytes=10) == b"place/file"
+    assert read_regular(Below(place, "file"), most_bytes=10) == b"place/file"
     with pytest.raises(OSError, match="larger than 9 bytes"):
-        read_regular(place / "file", place, most_bytes=9)
+        read_regular(Below(place, "file"), most_bytes=9)
 
 
 def test_a_path_that_is_a_link_or_leads_over_one_is_refused(place: Path) -> None:
-    check_links(place / "inner" / "new", place)
-    check_links(place, place)
-    for name in ("link", "out", "out/new", "../outside"):
+    Below(place, "inner/new").check_links()
+    Below(place, ".").check_links()
+    for name in ("link", "out", "out/new", "../outside", str(place / "inner")):
         with pytest.raises(NotRegularFileError):
-            check_links(place / name, place)
+            Below(place, name).check_links()
