@@ -40,6 +40,10 @@ LARGEST_R2 = 0.98
 """Upper limit of a squared correlation. A robot follows its wheels with a small, varying delay, so that a larger value
 has no further meaning."""
 
+LEAST_CHANGE = 1e-3
+"""Variance of the pairs of a lag, as a share of the variance of the whole column, below which the rounding of Fourier
+transforms matters."""
+
 LEAP_S = 18.0
 """Time by which GPS time is ahead of UTC since 2017 [s]."""
 
@@ -284,14 +288,52 @@ def find_shift(wheels: _Rates, other: _Rates) -> float:
 
 
 def _correlations(own: Floats, seen: Floats, lags: Ints) -> tuple[Floats, Floats]:
-    """Return squared correlations (l,) of a column with one that is `lags` steps later, and numbers of pairs."""
-    found, counts = np.zeros(len(lags)), np.zeros(len(lags))
-    for row, lag in enumerate(lags.tolist()):
-        a, b = (own[: len(own) - lag], seen[lag:]) if lag >= 0 else (own[-lag:], seen[:lag])
-        both = np.isfinite(a) & np.isfinite(b)
-        a, b = a[both] - a[both].mean() if both.any() else a[both], b[both] - b[both].mean() if both.any() else b[both]
-        scale = math.sqrt(float(a @ a) * float(b @ b)) if len(a) > 2 else 0.0
-        found[row], counts[row] = (float(a @ b) / scale) ** 2 if scale > 0.0 else 0.0, len(a)
+    """Return squared correlations (l,) of a column with one that is `lags` steps later, and numbers of pairs.
+
+    Notes
+    -----
+    The sums over pairs of all lags are six cross-correlations, by Fourier transforms (Padfield 2012, "Masked
+    Object Registration in the Fourier Domain"). A lag at which a column hardly changes is computed by its pairs alone.
+    """
+    size = 1 << (len(own) + int(np.abs(lags).max(initial=0))).bit_length()
+    of_own, of_seen = (np.fft.rfft(_powers(column), size) for column in (own, seen))
+
+    def sums(own_power: int, seen_power: int) -> Floats:
+        return np.asarray(np.fft.irfft(np.conj(of_own[own_power]) * of_seen[seen_power], size)[lags])
+
+    counts = np.rint(sums(0, 0))
+    pairs = np.maximum(counts, 1.0)
+    own_mean, seen_mean = sums(1, 0) / pairs, sums(0, 1) / pairs
+    own_change, seen_change = sums(2, 0) / pairs - own_mean**2, sums(0, 2) / pairs - seen_mean**2
+    clear = (counts > 2) & (np.minimum(own_change, seen_change) > LEAST_CHANGE)
+    found = np.zeros(len(lags))
+    together = sums(1, 1) / pairs - own_mean * seen_mean
+    found[clear] = together[clear] ** 2 / (own_change[clear] * seen_change[clear])
     # few pairs at the ends would seem to fit
-    found[counts < 0.5 * counts.max(initial=0.0)] = 0.0
-    return found, counts
+    enough = counts >= 0.5 * counts.max(initial=0.0)
+    for row in np.flatnonzero(enough & ~clear):
+        found[row] = _correlation(own, seen, int(lags[row]))
+    return np.where(enough, found, 0.0), counts
+
+
+def _powers(column: Floats) -> Floats:
+    """Return powers 0, 1 and 2 (3, n) of a column with mean 0 and standard deviation 1; 0 where it is not known."""
+    known = np.isfinite(column)
+    if not known.any():
+        return np.zeros((3, len(column)))
+    centred = np.where(known, column - column[known].mean(), 0.0)
+    std = math.sqrt(float(np.square(centred).mean() / known.mean()))
+    scaled = centred / std if std > 0.0 else centred
+    return np.array([known, scaled, np.square(scaled)], np.float64)
+
+
+def _correlation(own: Floats, seen: Floats, lag: int) -> float:
+    """Return the squared correlation of a column with one that is some steps later; 0 where one is constant."""
+    a, b = (own[: len(own) - lag], seen[lag:]) if lag >= 0 else (own[-lag:], seen[:lag])
+    both = np.isfinite(a) & np.isfinite(b)
+    a, b = a[both], b[both]
+    if len(a) < 3 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return 0.0
+    a, b = a - a.mean(), b - b.mean()
+    scale = math.sqrt(float(np.square(a).sum() * np.square(b).sum()))
+    return (float((a * b).sum()) / scale) ** 2 if scale > 0.0 else 0.0

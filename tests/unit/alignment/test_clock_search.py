@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from icrtool.alignment.clock_search import take_shifts
+from icrtool.alignment.clock_search import _correlations, take_shifts
 from icrtool.config import load_config
+from icrtool.kernels.arrays import Floats
 from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import GyroAxes, GyroSamples
@@ -111,3 +112,33 @@ def test_a_drive_that_repeats_itself_shows_no_shift() -> None:
     heading = replace(log.heading, heading_rad=0.0 * log.heading.heading_rad)
     found = take_shifts(later(replace(repeated, heading=heading), gnss=12.0), load_config(sets=SETS))[2]
     assert found.gnss == 0.0
+
+
+def by_pairs(own: Floats, seen: Floats, lag: int) -> tuple[float, int]:
+    """Return the squared correlation at a lag and its number of pairs, pair by pair."""
+    pairs = [(own[i], seen[i + lag]) for i in range(len(own)) if 0 <= i + lag < len(seen)]
+    a, b = np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2).T
+    if len(a) < 3 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return 0.0, len(a)
+    return float(np.corrcoef(a, b)[0, 1]) ** 2, len(a)
+
+
+@pytest.mark.parametrize("kind", ["random", "parked, then driven", "parked", "one spike", "mostly unknown", "unknown"])
+def test_correlations_by_transforms_are_those_of_the_pairs(kind: str) -> None:
+    rng = np.random.default_rng(5)
+    own = np.cumsum(rng.normal(size=400)) + 1e3
+    seen = np.roll(own, 12) + rng.normal(size=400)
+    if kind == "parked, then driven":
+        own[:330], seen[:350] = 0.0, rng.normal(0.0, 1e-6, 350)
+    elif kind == "parked":
+        own[:] = 0.0
+    elif kind == "one spike":
+        seen[395] = 1e7
+    for column in (own, seen):
+        column[rng.random(400) < {"mostly unknown": 0.8, "unknown": 1.0}.get(kind, 0.1)] = np.nan
+    lags = np.arange(-150, 151)
+    found, counts = _correlations(own, seen, lags)
+    expected = np.array([by_pairs(own, seen, lag) for lag in lags.tolist()])
+    np.testing.assert_array_equal(counts, expected[:, 1])
+    few = expected[:, 1] < 0.5 * expected[:, 1].max()
+    np.testing.assert_allclose(found, np.where(few, 0.0, expected[:, 0]), rtol=0.0, atol=1e-9)
