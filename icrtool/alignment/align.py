@@ -54,10 +54,10 @@ def align(log: RobotLog, config: Config) -> Measurements:
     DataError
         Streams that cannot be used together, or a heading without any relation to the course over ground.
     """
-    given = NO_SHIFTS
+    configured_shifts = NO_SHIFTS
     if config.filter.rules.corrects:
         # before anything looks at the streams
-        log, config, given = with_configured_delays(log, config)
+        log, config, configured_shifts = with_configured_delays(log, config)
         log = without_interpolated(log)
     log = with_wheel_speeds(log, config)
     if not config.filter.rules.corrects:
@@ -66,15 +66,15 @@ def align(log: RobotLog, config: Config) -> Measurements:
     log, size = with_right_size(without_bad_start(without_frozen(log)), config)
     width = width_or_usual_m(config.robot.track_width_m)
     log, config, shifts = take_shifts(log, config)
-    found = _align_once(log, config)
-    seen = find_disagreements(found.sensors, width)
-    if seen.events:
+    measurements = _align_once(log, config)
+    disagreements = find_disagreements(measurements.sensors, width)
+    if disagreements.events:
         # Aligned again without the events, where the rest of the drive is long enough.
         with suppress(DataError):
-            spans = tuple((event.begin_ns, event.end_ns) for event in seen.events)
-            found = _align_once(replace(log, slipping_ns=spans), config)
-            seen = find_disagreements(found.sensors, width)
-    filled, bridge = bridged(found.sensors.wheels, config.filter.wheel_gap_s, found.sensors.fixes)
+            spans = tuple((event.begin_ns, event.end_ns) for event in disagreements.events)
+            measurements = _align_once(replace(log, slipping_ns=spans), config)
+            disagreements = find_disagreements(measurements.sensors, width)
+    filled, bridge = bridged(measurements.sensors.wheels, config.filter.wheel_gap_s, measurements.sensors.fixes)
     notes = about(log.name, [*shifts.notes, *([] if bridge is None else [bridge])])
     sensors = replace(found.sensors, wheels=filled, events=seen.events, jumps=seen.jumps)
     found = _with_size(replace(found, findings=with_shifts(with_shifts(found.findings, given), shifts)), size)
@@ -108,33 +108,33 @@ def _with_size(found: Measurements, factor: float) -> Measurements:
 
 
 def _align_once(log: RobotLog, config: Config) -> Measurements:
-    found = align_streams(log, config)
-    heading, derived = found.heading, found.derived
-    fix_steps, heading_steps = found.steps()
-    position_std_m, heading_std_rad = reference_noise(found.log, config.filter, fix_steps, heading_steps)
-    quality = grade_fixes(found.log, config, fix_steps, position_std_m)
-    check_streams(found.log)
-    headings, antenna_m = found.log.heading, _antenna_m(log, config)
-    findings = alignment_findings(found, antenna_m)
+    streams = align_streams(log, config)
+    heading, derived = streams.heading, streams.derived
+    fix_steps, heading_steps = streams.steps()
+    position_std_m, heading_std_rad = reference_noise(streams.log, config.filter, fix_steps, heading_steps)
+    quality = grade_fixes(streams.log, config, fix_steps, position_std_m)
+    check_streams(streams.log)
+    headings, antenna_m = streams.log.heading, _antenna_m(log, config)
+    findings = alignment_findings(streams, antenna_m)
     if derived is None:
         noise = heading_variance(headings, config.filter, math.radians(heading.applied_std_deg), heading_std_rad)
         corrected = headings.heading_rad - math.radians(heading.applied_offset_deg)
         headings = replace(headings, heading_rad=corrected, var_rad2=noise)
     sensors = SensorData(
         name=log.name,
-        wheels=found.log.wheels,
+        wheels=streams.log.wheels,
         fixes=quality.fixes,
         headings=headings,
-        gyro=found.log.gyro,
+        gyro=streams.log.gyro,
         facts=LogFacts(
-            heading_from_position=found.log.heading_is_of_position,
-            heading_correlation_s=max(config.filter.heading_correlation_s, found.correlation_s),
+            heading_from_position=streams.log.heading_is_of_position,
+            heading_correlation_s=max(config.filter.heading_correlation_s, streams.correlation_s),
             heading_is_estimated=derived is not None,
             heading_is_measured=math.isfinite(heading_std_rad),
-            turn_wander_rad=None if found.fit is None else known(found.fit.turn_wander_rad),
+            turn_wander_rad=None if streams.fit is None else known(streams.fit.turn_wander_rad),
             antenna_m=antenna_m,
             antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
-            clock_std_s=found.delays.clock_std_s,
+            clock_std_s=streams.delays.clock_std_s,
             heading_sensor=log.heading_sensor,
         ),
         losses_ns=quality.losses_ns,
@@ -143,11 +143,11 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
     return Measurements(
         sensors=sensors,
         findings=findings,
-        wheels=found.wheels,
+        wheels=streams.wheels,
         heading=heading,
-        streams=found.log.streams,
+        streams=streams.log.streams,
         fix_statistics=quality.statistics,
-        notes=(*found.log.notes, *found.notes, *quality.notes),
+        notes=(*streams.log.notes, *streams.notes, *quality.notes),
     )
 
 
@@ -178,24 +178,24 @@ def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
 def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
     """Return the antenna's place in the body frame, forward and right [m]: configured, else the log's own, else 0."""
     forward, right = log.antenna_m if log.antenna_m is not None else (0.0, 0.0)
-    given = config.frames
+    frames = config.frames
     return (
-        forward if given.antenna_forward_m == "auto" else given.antenna_forward_m,
-        right if given.antenna_right_m == "auto" else given.antenna_right_m,
+        forward if frames.antenna_forward_m == "auto" else frames.antenna_forward_m,
+        right if frames.antenna_right_m == "auto" else frames.antenna_right_m,
     )
 
 
 NOT_A_CORRECTION = "compared with the filter's ICRs"
 
 
-def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
+def alignment_findings(streams: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
     """Return all estimates of the alignment, by name with unit; side scales and ICRs where they were estimated.
 
     Parameters
     ----------
     antenna_m : the antenna from the body origin, forward and right; the ICRs refer to the origin
     """
-    wheels, heading, delays = found.wheels, found.heading, found.delays
+    wheels, heading, delays = streams.wheels, streams.heading, streams.delays
     offset = None if heading.offset_deg is None else -heading.offset_deg
     findings = {
         "wheel_scale": _finding(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
@@ -206,16 +206,16 @@ def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) ->
             *delays.apart, delays.applied_gnss_s - delays.applied_heading_s if not delays.together else 0.0
         ),
     }
-    if found.fit is None:
+    if streams.fit is None:
         return findings
-    (right, left, x, multiplier, left_scale, right_scale), covariance = found.fit.geometry()
-    (forward_m, right_m), width = antenna_m, found.fit.width_m
+    (right, left, x, multiplier, left_scale, right_scale), covariance = streams.fit.geometry()
+    (forward_m, right_m), width = antenna_m, streams.fit.width_m
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     middle_std = math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)) / 2
     place = "only the position of the antenna relative to the ICRs is determined"
     return findings | {
-        "left_scale": _finding(left_scale, std[4], found.scales[0], nothing=1.0),
-        "right_scale": _finding(right_scale, std[5], found.scales[1], nothing=1.0),
+        "left_scale": _finding(left_scale, std[4], streams.scales[0], nothing=1.0),
+        "right_scale": _finding(right_scale, std[5], streams.scales[1], nothing=1.0),
         "icr_separation_m": Finding(width * multiplier, width * std[3], 0.0, NOT_A_CORRECTION),
         "antenna_forward_minus_x_icr_m": Finding(-x, std[2], forward_m, place),
         "antenna_right_minus_icr_middle_m": Finding(-(right + left) / 2, middle_std, right_m, place),
@@ -278,9 +278,9 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
     chosen = agreement(log, config)
     if chosen.residual_m <= POOR_M:
         return log
-    found = [(agreement(other, config), other) for other in log.other_references]
+    candidates = [(agreement(other, config), other) for other in log.other_references]
     least = LEAST_SHARE_COVERED * chosen.distance_m
-    fit = [(one.residual_m, other) for one, other in found if one.distance_m > least]
+    fit = [(one.residual_m, other) for one, other in candidates if one.distance_m > least]
     residual, best = min(fit, key=lambda one: one[0], default=(math.inf, log))
     if not residual < min(BETTER_RESIDUAL_RATIO * chosen.residual_m, POOR_M):
         return log
@@ -309,11 +309,11 @@ def agreement(log: RobotLog, config: Config) -> Agreement:
     windows = cut_drive_windows(track, length_m=LENGTH_M)
     free = config.frames.heading == "auto"
     decision = decide_conventions(windows, metric=log.datum is None and free, mirror_allowed=free)
-    named = apply_convention(log, decision.convention)
-    found = estimate_alignment(windows if named is log else replace(windows, track=track_of_log(named)), width)
-    if found is None:
+    named_log = apply_convention(log, decision.convention)
+    fit = estimate_alignment(windows if named_log is log else replace(windows, track=track_of_log(named_log)), width)
+    if fit is None:
         return NONE
     count = len(windows.begin)
-    size = np.hypot(found.fit.residuals[:count], found.fit.residuals[count : 2 * count])
+    size = np.hypot(fit.fit.residuals[:count], fit.fit.residuals[count : 2 * count])
     covered = np.unique(np.floor(track.distance[windows.begin] / LENGTH_M))
     return Agreement(float(np.quantile(size, SHARE)), LENGTH_M * len(covered))

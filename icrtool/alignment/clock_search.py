@@ -73,12 +73,12 @@ def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Con
     log; the configuration in which no configured delay is left; what was moved
     """
     frames = config.frames
-    given: dict[str, float] = {
+    delays_s: dict[str, float] = {
         key: float(one)
         for key, one in (("reference_delay_s", frames.reference_delay_s), ("heading_delay_s", frames.heading_delay_s))
         if one != "auto"
     }
-    gnss, heading = (given.get(key, 0.0) for key in ("reference_delay_s", "heading_delay_s"))
+    gnss, heading = (delays_s.get(key, 0.0) for key in ("reference_delay_s", "heading_delay_s"))
     heading = gnss if log.heading_is_of_position else heading
     if gnss == heading == 0.0:
         return log, config, NO_SHIFTS
@@ -122,7 +122,7 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
     """
     frames, notes = config.frames, list[Note]()
     free = frames.reference_delay_s == "auto", frames.heading_delay_s == "auto"
-    log, config, given = with_configured_delays(log, config)
+    log, config, configured = with_configured_delays(log, config)
     shifts: dict[str, float] = {}
     own = _Rates.of_wheels(log) if _can_be_compared(log) else None
     for word, key, sought in (("gnss", "reference_delay_s", free[0]), ("heading", "heading_delay_s", free[1])):
@@ -257,7 +257,7 @@ def _known(stamps: Ints, log: RobotLog) -> Bools:
     return np.asarray(inside & (stamps[after] - stamps[after - 1] < max(1.5e9, 3.0 * usual)))
 
 
-def find_shift(wheels: _Rates, other: _Rates) -> float:
+def find_shift(wheels: _Rates, stream: _Rates) -> float:
     """Return how much later than the wheels a stream is stamped [s]; 0 where it is less than 3 s, or not shown.
 
     Notes
@@ -267,10 +267,10 @@ def find_shift(wheels: _Rates, other: _Rates) -> float:
     """
     lags = np.arange(-round(LONGEST_SHIFT_S / GRID_S), round(LONGEST_SHIFT_S / GRID_S) + 1)
     gain, best_r = np.zeros(len(lags)), np.zeros(len(lags))
-    for own, seen in ((wheels.speed, other.speed), (wheels.turn, other.turn)):
-        if own is None or seen is None:
+    for wheel_rate, stream_rate in ((wheels.speed, stream.speed), (wheels.turn, stream.turn)):
+        if wheel_rate is None or stream_rate is None:
             continue
-        r2, count = _correlations(own, seen, lags)
+        r2, count = _correlations(wheel_rate, stream_rate, lags)
         # the same number of pairs for all lags: a longer overlap of streams is no evidence of a lag
         gain -= count.max() * GRID_S / INDEPENDENT_S * np.log1p(-np.minimum(r2, LARGEST_R2))
         best_r = np.maximum(best_r, np.sqrt(r2))
@@ -287,7 +287,7 @@ def find_shift(wheels: _Rates, other: _Rates) -> float:
     return shift + GRID_S * (0.5 * float((before - behind) / bend) if bend < 0.0 else 0.0)
 
 
-def _correlations(own: Floats, seen: Floats, lags: Ints) -> tuple[Floats, Floats]:
+def _correlations(column: Floats, later_column: Floats, lags: Ints) -> tuple[Floats, Floats]:
     """Return squared correlations (l,) of a column with one that is `lags` steps later, and numbers of pairs.
 
     Notes
@@ -295,8 +295,8 @@ def _correlations(own: Floats, seen: Floats, lags: Ints) -> tuple[Floats, Floats
     The sums over pairs of all lags are six cross-correlations, by Fourier transforms (Padfield 2012, "Masked
     Object Registration in the Fourier Domain"). A lag at which a column hardly changes is computed by its pairs alone.
     """
-    size = 1 << (len(own) + int(np.abs(lags).max(initial=0))).bit_length()
-    of_own, of_seen = (np.fft.rfft(_powers(column), size) for column in (own, seen))
+    size = 1 << (len(column) + int(np.abs(lags).max(initial=0))).bit_length()
+    of_own, of_seen = (np.fft.rfft(_powers(column), size) for column in (column, later_column))
 
     def sums(own_power: int, seen_power: int) -> Floats:
         return np.asarray(np.fft.irfft(np.conj(of_own[own_power]) * of_seen[seen_power], size)[lags])
@@ -312,7 +312,7 @@ def _correlations(own: Floats, seen: Floats, lags: Ints) -> tuple[Floats, Floats
     # few pairs at the ends would seem to fit
     enough = counts >= 0.5 * counts.max(initial=0.0)
     for row in np.flatnonzero(enough & ~clear):
-        found[row] = _correlation(own, seen, int(lags[row]))
+        found[row] = _correlation(column, later_column, int(lags[row]))
     return np.where(enough, found, 0.0), counts
 
 
@@ -327,9 +327,9 @@ def _powers(column: Floats) -> Floats:
     return np.array([known, scaled, np.square(scaled)], np.float64)
 
 
-def _correlation(own: Floats, seen: Floats, lag: int) -> float:
+def _correlation(column: Floats, later_column: Floats, lag: int) -> float:
     """Return the squared correlation of a column with one that is some steps later; 0 where one is constant."""
-    a, b = (own[: len(own) - lag], seen[lag:]) if lag >= 0 else (own[-lag:], seen[:lag])
+    a, b = (column[: len(column) - lag], later_column[lag:]) if lag >= 0 else (column[-lag:], later_column[:lag])
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
     if len(a) < 3 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:

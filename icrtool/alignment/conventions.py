@@ -138,22 +138,26 @@ def decide_conventions(
         return Decision(AS_NAMED, None)
     track = windows.track
     laid = windows.laid, windows.over(track.at_places(track.half_difference * track.nose))
-    shown = {1: _show(windows, laid, 1), -1: _show(windows, (np.conj(laid[0]), np.conj(laid[1])), -1)}
+    fits = {1: _show(windows, laid, 1), -1: _show(windows, (np.conj(laid[0]), np.conj(laid[1])), -1)}
     # twice the negative log-likelihood of each handedness, both with the noise of the better one
-    scale = min(mad_std(one.residuals, 0.0) for one in shown.values())
+    scale = min(mad_std(convention.residuals, 0.0) for convention in fits.values())
     scale = max(scale, 0.5 * track.place_std_m / windows.length_m[0])
-    losses = {hand: soft_l1_loss(one.residuals / scale) / STARTS_A_WINDOW for hand, one in shown.items()}
+    losses = {hand: soft_l1_loss(convention.residuals / scale) / STARTS_A_WINDOW for hand, convention in fits.items()}
     costs, offsets = dict[Convention, float](), dict[Convention, float]()
     headings, positions = (1, -1) if mirror_allowed else (1,), (1, -1) if metric else (1,)
-    for one in map(Convention._make, product((False, True), (1, -1), (1, -1), headings, positions)):
-        hand = one.heading * one.position
-        cost, offsets[one] = _cost(one, shown[hand])
-        costs[one] = cost + losses[hand]
+    for convention in map(Convention._make, product((False, True), (1, -1), (1, -1), headings, positions)):
+        hand = convention.heading * convention.position
+        cost, offsets[convention] = _cost(convention, fits[hand])
+        costs[convention] = cost + losses[hand]
     best = min(costs.values())
     if costs[AS_NAMED] - best < DECISIVE:
         return Decision(AS_NAMED, None)
-    likely = {one: one.faults(offsets[one], track, gyro_sense) for one in costs if costs[one] < best + TIE}
-    ranked = sorted(likely, key=lambda one: (likely[one], costs[one]))
+    likely = {
+        convention: convention.faults(offsets[convention], track, gyro_sense)
+        for convention in costs
+        if costs[convention] < best + TIE
+    }
+    ranked = sorted(likely, key=lambda convention: (likely[convention], costs[convention]))
     chosen = ranked[0]
     close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5
     return Decision(chosen, ranked[1] if close else None)
@@ -183,10 +187,10 @@ class NamedFit(NamedTuple):
         """Return the fit to the windows of a log."""
         track = windows.track
         laid = windows.laid, windows.over(track.at_places(track.half_difference * track.nose))
-        shown = _show(windows, laid, 1)
-        std = math.sqrt(max(float(shown.turn_covariance[0, 0]), 1e-24))
-        offset = math.atan2(float(shown.z[1]), float(shown.z[0]))
-        return cls(shown.residuals, float(mad_std(shown.residuals, 0.0)), offset, float(shown.turn[0]) / std)
+        fit = _show(windows, laid, 1)
+        std = math.sqrt(max(float(fit.turn_covariance[0, 0]), 1e-24))
+        offset = math.atan2(float(fit.z[1]), float(fit.z[0]))
+        return cls(fit.residuals, float(mad_std(fit.residuals, 0.0)), offset, float(fit.turn[0]) / std)
 
 
 def senses_by_distance(track: Track) -> Convention:
@@ -236,50 +240,50 @@ def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -
     return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group), place.residuals)
 
 
-def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
+def _cost(convention: Convention, fit: _Shown) -> tuple[float, float]:
     """Return the squared Mahalanobis distance of the fit from a convention's expected values, and its offset."""
-    sides = np.diag([float(one.sign_left), float(one.sign_right)])
-    if one.swapped:
+    sides = np.diag([float(convention.sign_left), float(convention.sign_right)])
+    if convention.swapped:
         sides = sides[::-1]
     # `back` maps (v, u) of the true sides to (v, u) of the named sides: p = Z (v, u)_named = Z back (v, u)_true
     halves = np.array([[0.5, 0.5], [0.5, -0.5]])
     back = 2.0 * halves @ sides.T @ halves
     lift = np.kron(back.T, np.eye(2))
-    z = lift @ shown.z
+    z = lift @ fit.z
     offset = math.atan2(z[1], z[0])
     c, s = math.cos(offset), math.sin(offset)
     place = np.kron(np.eye(2), [[c, s], [-s, c]]) @ lift / max(math.hypot(z[0], z[1]), math.hypot(z[2], z[3]), 1e-9)
-    turn = one.position * back.T[::-1, ::-1]
-    turn /= max(float(np.abs(turn @ shown.turn).max()), 1e-9)
+    turn = convention.position * back.T[::-1, ::-1]
+    turn /= max(float(np.abs(turn @ fit.turn).max()), 1e-9)
     cost = 0.0
     for scaled, value, covariance, expected, std in (
-        (place, shown.z, shown.z_covariance, [1.0, 0.0, 0.0, 0.0], EXPECTED_STD[:4]),
-        (turn, shown.turn, shown.turn_covariance, [1.0, 0.0], EXPECTED_STD[4:]),
+        (place, fit.z, fit.z_covariance, [1.0, 0.0, 0.0, 0.0], EXPECTED_STD[:4]),
+        (turn, fit.turn, fit.turn_covariance, [1.0, 0.0], EXPECTED_STD[4:]),
     ):
         away = scaled @ value - expected
         cost += float(away @ np.linalg.solve(scaled @ covariance @ scaled.T + np.diag(std**2), away))
-    return cost, math.remainder(offset * one.position, 2 * math.pi)
+    return cost, math.remainder(offset * convention.position, 2 * math.pi)
 
 
 def convention_notes(decision: Decision, *, corrects: bool) -> list[Note]:
     """Return findings on which sides or senses are not as named; the heading's own is reported with its offset."""
-    one, other, done = decision.convention, decision.as_likely, ": corrected" if corrects else ""
+    convention, alternative, done = decision.convention, decision.as_likely, ": corrected" if corrects else ""
     notes = []
-    if one.swapped:
+    if convention.swapped:
         notes.append(note("sides_swapped", f"left and right wheels are swapped{done}"))
-    signs = (one.sign_left, one.sign_right)
+    signs = (convention.sign_left, convention.sign_right)
     reversed_ = {(-1, 1): "the left wheels", (1, -1): "the right wheels", (-1, -1): "both wheels"}
     if signs in reversed_:
         notes.append(note("side_reversed", f"{reversed_[signs]} count backwards{done}"))
-    if one.position < 0:
+    if convention.position < 0:
         notes.append(note("positions_mirrored", f"positions are mirrored (east for west){done}"))
-    if other is not None:
+    if alternative is not None:
         parts = {
-            "swapped sides": other.swapped,
-            "a reversed left side": other.sign_left < 0,
-            "a reversed right side": other.sign_right < 0,
-            "a mirrored heading": other.heading < 0,
-            "mirrored positions": other.position < 0,
+            "swapped sides": alternative.swapped,
+            "a reversed left side": alternative.sign_left < 0,
+            "a reversed right side": alternative.sign_right < 0,
+            "a mirrored heading": alternative.heading < 0,
+            "mirrored positions": alternative.position < 0,
         }
         words = " with ".join(part for part, is_so in parts.items() if is_so)
         words = words or "sides as named and a heading turned by 180°"

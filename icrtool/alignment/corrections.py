@@ -21,7 +21,7 @@ from icrtool.alignment.conventions import (
     gyro_sense,
     senses_by_distance,
 )
-from icrtool.alignment.estimator import ESTIMATE_PRIOR_STD, TP, AlignmentFit, estimate_alignment
+from icrtool.alignment.estimator import ESTIMATE_PRIOR_STD, POSITION_LAG, AlignmentFit, estimate_alignment
 from icrtool.alignment.heading_alignment import (
     NOT_COMPARED,
     OTHER_CONVENTION,
@@ -106,7 +106,7 @@ class StreamDelays(NamedTuple):
             return 0.0
         if self.applied_gnss_s != self.applied_heading_s:
             return std
-        agree = ESTIMATE_PRIOR_STD[TP] / std * math.exp(-0.5 * (value / std) ** 2)
+        agree = ESTIMATE_PRIOR_STD[POSITION_LAG] / std * math.exp(-0.5 * (value / std) ** 2)
         return math.sqrt((std**2 + value**2) / (1.0 + agree))
 
 
@@ -261,8 +261,8 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         if lags[name] != 0.0
     }
     log = replace(log, **moved) if moved else log
-    found = about(log.name, (*notes, *of_wheels, *of_heading, *of_delays))
-    return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, found)
+    findings = about(log.name, (*notes, *of_wheels, *of_heading, *of_delays))
+    return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, findings)
 
 
 def _name_streams(

@@ -42,7 +42,11 @@ ESTIMATE_NAMES = (
     "heading_delay",
     "drag",
 )
-A, M, C, L, K, Q, G, D, TP, TH, N = range(11)
+(
+    WHEEL_SCALE, ICR_MIDDLE, SIDEWAYS, SIDE_SLIP, TURN_GAIN, SIDE_ASYMMETRY, HEADING_DRIFT, HEADING_OFFSET,
+    POSITION_LAG, HEADING_LAG, TURN_DRAG,
+) = range(11)  # fmt: skip
+"""Rows of the parameters: a, m, c, l, k, q, g, d, tau_p, tau_h and n of the equations above."""
 
 ESTIMATE_PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 ESTIMATE_PRIOR_STD = np.array([0.5, 0.1, 0.5, 0.2, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5, 0.1])
@@ -148,8 +152,8 @@ class AlignmentFit(NamedTuple):
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; ``position_delay`` is the delay against the wheels."""
         if name == "position_delay":
-            both = self.covariance[np.ix_([TP, TH], [TP, TH])]
-            return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(max(float(both.sum()), 0.0))
+            both = self.covariance[np.ix_([POSITION_LAG, HEADING_LAG], [POSITION_LAG, HEADING_LAG])]
+            return float(self.fit.x[POSITION_LAG] + self.fit.x[HEADING_LAG]), math.sqrt(max(float(both.sum()), 0.0))
         row = ESTIMATE_NAMES.index(name)
         variance = float(self.covariance[row, row])
         # rounding may leave a variance below zero where the drive hardly shows the parameter
@@ -196,26 +200,27 @@ class AlignmentFit(NamedTuple):
         """Return ICRs about the antenna, multiplier and side scales, and their covariance (6, 6)."""
         x, b, speed = self.fit.x, self.width_m, self.turning_speed_mps
         # at this speed, sideways slip l v w has the same effect as c
-        aside = x[C] + x[L] * speed
+        aside = x[SIDEWAYS] + x[SIDE_SLIP] * speed
         by = np.zeros((len(FIVE_TERMS.terms), len(x)))
-        by[[0, 1, 2, 3], [A, M, K, Q]] = 1.0
-        by[4, [K, C, L]] = np.array([aside, x[K], x[K] * speed]) * 2.0 / b
-        parameters = np.array([x[A], x[M], x[K], x[Q], x[K] * aside * 2.0 / b])
+        by[[0, 1, 2, 3], [WHEEL_SCALE, ICR_MIDDLE, TURN_GAIN, SIDE_ASYMMETRY]] = 1.0
+        by[4, [TURN_GAIN, SIDEWAYS, SIDE_SLIP]] = np.array([aside, x[TURN_GAIN], x[TURN_GAIN] * speed]) * 2.0 / b
+        sideways = x[TURN_GAIN] * aside * 2.0 / b
+        parameters = np.append(x[[WHEEL_SCALE, ICR_MIDDLE, TURN_GAIN, SIDE_ASYMMETRY]], sideways)
         values, covariance = FittedModel(FIVE_TERMS, parameters, by @ self.covariance @ by.T).geometry(b)
         # at one speed, positions that lag have the same effect as an antenna further back
         covariance[2, 2] += (speed * _clock_std_s(self.windows.track, b)) ** 2
         return values, covariance
 
 
-def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
+def residuals_by_estimate(fit: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
-    w = len(found.windows.begin)
+    count = 2 * len(fit.windows.begin)
     neutral = ESTIMATE_PRIOR_MEAN.copy()
-    neutral[K] = found.fit.x[K]
-    before, after = (found.model.evaluate(x)[0] for x in (neutral, found.fit.x))
+    neutral[TURN_GAIN] = fit.fit.x[TURN_GAIN]
+    before, after = (fit.model.evaluate(x)[0] for x in (neutral, fit.fit.x))
     return ResidualsByEstimate(
-        before[: 2 * w].reshape(2, w), after[: 2 * w].reshape(2, w), before[2 * w :], after[2 * w :],
-        found.windows.heading_changes,
+        before[:count].reshape(2, -1), after[:count].reshape(2, -1), before[count:], after[count:],
+        fit.windows.heading_changes,
     )  # fmt: skip
 
 
@@ -249,16 +254,16 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     unit = (windows.seen * np.conj(windows.laid))[np.abs(windows.laid) > windows.length_m / 3]
     spins = len(unit) < FEWEST_OVERLAPPING
     if not spins:
-        start[D] = np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12)))
-    w, u = len(windows.begin), len(windows.turn_begin)
-    kind = np.concatenate([np.zeros(w, np.int64), np.ones(w, np.int64), np.full(u, 2)])
+        start[HEADING_OFFSET] = np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12)))
+    distances, turns = len(windows.begin), len(windows.turn_begin)
+    kind = np.concatenate([np.zeros(distances, np.int64), np.ones(distances, np.int64), np.full(turns, 2)])
     group = np.concatenate([windows.group, windows.group, windows.turn_group])
     prior_std = ESTIMATE_PRIOR_STD.copy()
     # spins show the distance of the ICRs' middle from the antenna, but not its direction
-    prior_std[D] = MOUNTING_STD_RAD if spins else prior_std[D]
-    prior_std[TP] = SAME_CLOCK_STD_S if track.same_clock else prior_std[TP]
-    prior_std[M] = MIDDLE_STD_M / (1.5 * width_m)
-    prior_std[C] *= width_m
+    prior_std[HEADING_OFFSET] = MOUNTING_STD_RAD if spins else prior_std[HEADING_OFFSET]
+    prior_std[POSITION_LAG] = SAME_CLOCK_STD_S if track.same_clock else prior_std[POSITION_LAG]
+    prior_std[ICR_MIDDLE] = MIDDLE_STD_M / (1.5 * width_m)
+    prior_std[SIDEWAYS] *= width_m
     try:
         fit = robust_least_squares(
             model.evaluate,
@@ -275,11 +280,12 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     if not np.isfinite(covariance).all():
         # exact data on one circle do not separate the parameters
         return None
-    covariance[TH, TH] += RESPONSE_STD_S**2
-    covariance[A, A] += SCALE_STD**2
+    covariance[HEADING_LAG, HEADING_LAG] += RESPONSE_STD_S**2
+    covariance[WHEEL_SCALE, WHEEL_SCALE] += SCALE_STD**2
     if not track.same_clock:
-        covariance[TP, TP] += _clock_std_s(track, width_m) ** 2
-        covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(track.t[-1]), 1e-9))
+        covariance[POSITION_LAG, POSITION_LAG] += _clock_std_s(track, width_m) ** 2
+        share = min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(track.t[-1]), 1e-9))
+        covariance[HEADING_OFFSET, HEADING_OFFSET] += ATTITUDE_STD_RAD**2 * share
     weight = track.held * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
     return AlignmentFit(fit, covariance, width_m, windows, model, speed)
@@ -306,7 +312,7 @@ class MotionOfWindows:
         """Return residuals (2 w + u,) along, across and of turns, and their Jacobian (2 w + u, k)."""
         track, v, u, drag = self.track, self.v, self.u, np.abs(self.u)
         nose, rate, ahead, aside = self._motion(x)
-        t = self.edge_t - x[TP] - x[TH]
+        t = self.edge_t - x[POSITION_LAG] - x[HEADING_LAG]
         passed = np.interp(t, track.t, np.arange(len(track.t)))
         row = np.minimum(passed.astype(np.int64), len(track.t) - 2)
         part = passed - row
@@ -318,18 +324,22 @@ class MotionOfWindows:
             return np.asarray(end - begin)
 
         by = np.zeros((len(x), len(self.windows.begin)), np.complex128)
-        by[A], by[M], by[N], by[C], by[L] = laid(v), laid(u), laid(drag), 1j * laid(rate), 1j * laid(v * rate)
+        by[WHEEL_SCALE], by[ICR_MIDDLE], by[TURN_DRAG] = laid(v), laid(u), laid(drag)
+        by[SIDEWAYS], by[SIDE_SLIP] = 1j * laid(rate), 1j * laid(v * rate)
         predicted = x @ by
-        by[D] = 1j * predicted
+        by[HEADING_OFFSET] = 1j * predicted
         path = track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
         before, after = (np.interp(t + shift_s, track.t, path) for shift_s in (-DELAY_STEP_S, DELAY_STEP_S))
-        by[TP] = np.diff(before - after, axis=0) / (2 * DELAY_STEP_S)
+        by[POSITION_LAG] = np.diff(before - after, axis=0) / (2 * DELAY_STEP_S)
         # the derivative of the heading's unit vector, over `HEADING_STEP_S`
-        after, before = (track.heading_at(t + shift_s + x[TH]) + x[D] for shift_s in (HEADING_STEP_S, -HEADING_STEP_S))
+        after, before = (
+            track.heading_at(t + shift_s + x[HEADING_LAG]) + x[HEADING_OFFSET]
+            for shift_s in (HEADING_STEP_S, -HEADING_STEP_S)
+        )
         turning = 0.5j * (after - before) / HEADING_STEP_S * np.exp(0.5j * (after + before))
         begin, end = np.interp(t, track.t + track.held / 2, aside) * turning
-        by[TH] = by[TP] + 1j * laid(rate * ahead) + end - begin
-        level = self.level * np.exp(-1j * x[D])
+        by[HEADING_LAG] = by[POSITION_LAG] + 1j * laid(rate * ahead) + end - begin
+        level = self.level * np.exp(-1j * x[HEADING_OFFSET])
         place, by = (predicted - self.windows.seen) * level, by * level
         turn, turn_by = self._turns(x)
         return (
@@ -342,10 +352,10 @@ class MotionOfWindows:
         nose, rate, ahead, aside = self._motion(x)
         path = self.track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
         t = self.track.place_t
-        turn = x[K] * self.turn_w + x[Q] / self.b * self.turn_v + x[G] * self.track.t
+        turn = x[TURN_GAIN] * self.turn_w + x[SIDE_ASYMMETRY] / self.b * self.turn_v + x[HEADING_DRIFT] * self.track.t
         return (
-            np.asarray(np.interp(t - x[TP] - x[TH], self.track.t, path), np.complex128),
-            np.asarray(np.interp(t - x[TH], self.track.t, turn), np.float64),
+            np.asarray(np.interp(t - x[POSITION_LAG] - x[HEADING_LAG], self.track.t, path), np.complex128),
+            np.asarray(np.interp(t - x[HEADING_LAG], self.track.t, turn), np.float64),
         )
 
     def _motion(self, x: Floats) -> tuple[Complexes, Floats, Floats, Floats]:
@@ -353,22 +363,24 @@ class MotionOfWindows:
         track = self.track
         ends = np.append(track.t, track.t[-1] + track.held[-1])
         # a wheel speed acts along the heading of a later time, because a response delays both equally
-        heading = track.heading_at(ends + x[TH]) + x[D]
-        smooth = np.interp(ends + x[TH], track.heading_t, self.smooth_heading)
+        heading = track.heading_at(ends + x[HEADING_LAG]) + x[HEADING_OFFSET]
+        smooth = np.interp(ends + x[HEADING_LAG], track.heading_t, self.smooth_heading)
         rate = np.where(track.held > 0.0, np.diff(smooth) / np.maximum(track.held, 1e-9), 0.0)
-        ahead = x[A] * self.v + x[M] * self.u + x[N] * np.abs(self.u)
-        return np.exp(0.5j * (heading[1:] + heading[:-1])), rate, ahead, x[C] + x[L] * self.v
+        ahead = x[WHEEL_SCALE] * self.v + x[ICR_MIDDLE] * self.u + x[TURN_DRAG] * np.abs(self.u)
+        return np.exp(0.5j * (heading[1:] + heading[:-1])), rate, ahead, x[SIDEWAYS] + x[SIDE_SLIP] * self.v
 
     def _turns(self, x: Floats) -> tuple[Floats, Floats]:
         """Return predicted minus seen heading changes (u,), and their derivatives (k, u)."""
-        edges = np.stack([self.windows.turn_begin, self.windows.turn_end]) - x[TH]
+        edges = np.stack([self.windows.turn_begin, self.windows.turn_end]) - x[HEADING_LAG]
 
         def over(values: Floats, shift_s: float = 0.0) -> Floats:
             begin, end = np.interp(edges + shift_s, self.track.t, values)
             return np.asarray(end - begin)
 
         by = np.zeros((len(x), edges.shape[1]))
-        by[K], by[Q], by[G] = over(self.turn_w), over(self.turn_v) / self.b, edges[1] - edges[0]
+        by[TURN_GAIN], by[SIDE_ASYMMETRY] = over(self.turn_w), over(self.turn_v) / self.b
+        by[HEADING_DRIFT] = edges[1] - edges[0]
         predicted = x @ by
-        by[TH] = x[K] * (over(self.turn_w, -DELAY_STEP_S) - over(self.turn_w, DELAY_STEP_S)) / (2 * DELAY_STEP_S)
+        later, earlier = over(self.turn_w, -DELAY_STEP_S), over(self.turn_w, DELAY_STEP_S)
+        by[HEADING_LAG] = x[TURN_GAIN] * (later - earlier) / (2 * DELAY_STEP_S)
         return predicted - self.windows.heading_changes, by

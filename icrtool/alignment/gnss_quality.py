@@ -93,9 +93,9 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
         if not (changes and rows.any() and math.isfinite(std)):
             continue
         silent_m2 = unstated_position_std_m(config.filter) ** 2
-        shown = np.where(np.isfinite(variance[rows]) & (variance[rows] > 0), variance[rows], silent_m2)
-        if std**2 > NOISIER**2 * float(np.median(shown)):
-            variance[rows], raised[name] = np.maximum(shown, std**2), std
+        stated_variance = np.where(np.isfinite(variance[rows]) & (variance[rows] > 0), variance[rows], silent_m2)
+        if std**2 > NOISIER**2 * float(np.median(stated_variance)):
+            variance[rows], raised[name] = np.maximum(stated_variance, std**2), std
     down = ~fixed & norm
     variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
     if raised or down.any():
@@ -103,11 +103,11 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
     fixes = replace(
         fixes_of(gnss, config.filter, measured_m), fix_class=kinds, misreported=misreported, down_weighted=down
     )
-    given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
-    known = {name: given[(kinds == code) & np.isfinite(given)] for code, name in CLASSES.items()}
-    std_m = {name: float(np.median(one)) if len(one) else math.nan for name, one in known.items()}
+    used_std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+    known_std = {name: used_std[(kinds == code) & np.isfinite(used_std)] for code, name in CLASSES.items()}
+    std_m = {name: float(np.median(stds)) if len(stds) else math.nan for name, stds in known_std.items()}
     losses = _losses(gnss.stamp_ns, fixed) if norm else np.empty((0, 2), np.int64)
-    notes = _notes(fixes, stated, given, raised, changes=changes)
+    notes = _notes(fixes, stated, used_std, raised, changes=changes)
     return GnssQuality(fixes, FixStatistics(std_m, white), losses, about(log.name, notes))
 
 
@@ -132,9 +132,9 @@ def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
     least = np.select([kinds == code for code in CLASS_STD_M], list(CLASS_STD_M.values()), 0.0)[:, None]
     interval = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else 0.0
     alike = max(1.0, 2.0 * CORRELATION_S / interval) if interval > 0 else 1.0
-    own = np.maximum(np.where(np.isfinite(variance), variance, 0.0), least**2)
+    own_variance = np.maximum(np.where(np.isfinite(variance), variance, 0.0), least**2)
     # Above the largest accepted value the filter would treat the variance as unknown and the fix as a good one.
-    grown: Floats = np.minimum(alike * own, (LARGEST_SANE_GNSS_STD_M / 2) ** 2)
+    grown: Floats = np.minimum(alike * own_variance, (LARGEST_SANE_GNSS_STD_M / 2) ** 2)
     return grown
 
 
@@ -152,12 +152,12 @@ def _losses(stamps: Ints, fixed: Bools) -> Ints:
     return np.column_stack([times[:-1][lost], ends[lost]])
 
 
-def _notes(fixes: Fixes, stated: Floats, given: Floats, raised: dict[str, float], *, changes: bool) -> list[Note]:
+def _notes(fixes: Fixes, stated: Floats, used_std: Floats, raised: dict[str, float], *, changes: bool) -> list[Note]:
     """Return findings on fixes that are not fixed, and on classes whose noise was raised to their scatter.
 
     Parameters
     ----------
-    stated, given : (m,) deviations before and after [m]; raised : [m] by class
+    stated, used_std : (m,) deviations before and after [m]; raised : [m] by class
     """
 
     def accuracy(rows: Bools, silent: str) -> str:
@@ -174,7 +174,7 @@ def _notes(fixes: Fixes, stated: Floats, given: Floats, raised: dict[str, float]
         text = f"{count} state {accuracy(misreported, 'that they are fixed')} but scatter or jump like RTK float"
         notes.append(note("gnss_float_as_fixed", f"{text}{': taken as float' if changes else ''}"))
     if down.any():
-        used = f"they are used with ±{np.median(given[down]):.2g} m"
+        used = f"they are used with ±{np.median(used_std[down]):.2g} m"
         notes.append(note("gnss_not_fixed", f"{down_count} are not RTK fixed, as most of this log are: {used}"))
     for code, name in CLASSES.items():
         rows = fixes.fix_class == code

@@ -129,8 +129,8 @@ def _turns(fit: AlignmentFit) -> _Turns | None:
         return None
     x = np.interp(end - delay, track.t, turned) - np.interp(begin - delay, track.t, turned)
     y = track.heading_at(end) - track.heading_at(begin)
-    kept = track.clear(begin - delay, end - delay)
-    begin, x, y = begin[kept], x[kept], y[kept]
+    usable = track.clear(begin - delay, end - delay)
+    begin, x, y = begin[usable], x[usable], y[usable]
     return _Turns(begin, x, y, np.floor(begin / CHANGE_GROUP_S).astype(np.int64))
 
 
@@ -152,17 +152,17 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
 
     count = len(places)
     best = np.array([np.inf, *(float(remaining(np.array([0]), stop)[0]) for stop in range(1, count))])
-    came, ways, costs = list[Ints](), list[list[int]](), list[float]()
+    best_before, ways, costs = list[Ints](), list[list[int]](), list[float]()
     for changes in range(MOST_CHANGES + 1):
         if changes:
             by_first = [best[:stop] + remaining(np.arange(stop), stop) for stop in range(1, count)]
-            came.append(np.array([0, *(int(np.argmin(one)) for one in by_first)]))
+            best_before.append(np.array([0, *(int(np.argmin(one)) for one in by_first)]))
             best = np.array([np.inf, *(float(one.min()) for one in by_first)])
         if not math.isfinite(best[-1]):
             break
         at, rows = count - 1, [count - 1]
-        for before in reversed(came):
-            at = int(before[at])
+        for of_row in reversed(best_before):
+            at = int(of_row[at])
             rows.append(at)
         ways.append([0, *(int(places[row]) for row in reversed(rows))])
         costs.append(float(best[-1]))
@@ -177,12 +177,12 @@ def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
         square = np.maximum(xx[stop] - xx[first], 1e-12)
         return np.asarray(yy[stop] - yy[first] - (xy[stop] - xy[first]) ** 2 / square)
 
-    found = list(rows)
+    refined = list(rows)
     for i in range(1, len(rows) - 1):
         at = int(np.searchsorted(places, rows[i]))
-        tried = np.arange(max(int(places[at - 1]), found[i - 1]) + 1, min(int(places[at + 1]), rows[i + 1]))
-        found[i] = int(tried[np.argmin(remaining(found[i - 1], tried) + remaining(tried, rows[i + 1]))])
-    return found
+        tried = np.arange(max(int(places[at - 1]), refined[i - 1]) + 1, min(int(places[at + 1]), rows[i + 1]))
+        refined[i] = int(tried[np.argmin(remaining(refined[i - 1], tried) + remaining(tried, rows[i + 1]))])
+    return refined
 
 
 def _stretches(turns: _Turns, rows: list[int]) -> tuple[GroundStretch, ...] | None:

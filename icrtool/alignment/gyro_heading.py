@@ -261,9 +261,9 @@ class _Problem:
         x[ANGLE] = self.stated.z[first] - (self.at[first] - self.at[0])
         q[ANGLE], q[BIAS] = noises["angle"] ** 2, noises["bias"] ** 2
         for i in range(count):
-            one = int(np.argmax(self.kind == ABSOLUTE + i))
+            row = int(np.argmax(self.kind == ABSOLUTE + i))
             at = STATES_OF_A_SOURCE * i
-            x[at + OFFSET] = math.remainder(self.stated.z[one] - x[ANGLE] - (self.at[one] - self.at[0]), 2 * math.pi)
+            x[at + OFFSET] = math.remainder(self.stated.z[row] - x[ANGLE] - (self.at[row] - self.at[0]), 2 * math.pi)
             growth, size = noises[f"{i} rate"] ** 2, noises[f"{i} size"]
             std[at + OFFSET] = self.absolute[i].offset_std
             x[at + OFFSET] *= math.isinf(std[at + OFFSET])
@@ -324,30 +324,30 @@ class _Problem:
         fixed = np.ones(len(model.x), np.bool_)
         fixed[[ANGLE, BIAS]] = False
         fixed[GYRO_STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
-        both = np.outer(fixed, fixed)
-        start = np.where(fixed, states[-1], model.x), np.where(both, covariances[-1], model.P)
+        fixed_pairs = np.outer(fixed, fixed)
+        start = np.where(fixed, states[-1], model.x), np.where(fixed_pairs, covariances[-1], model.P)
         psi_variance, final_std = covariances[:, ANGLE, ANGLE].copy(), np.sqrt(np.diagonal(covariances[-1]))
         del covariances
         passes = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
         causal, of_causal = passes.x, passes.P
         del passes, events  # as large as the arrays at each sample below
-        t, turn, G = self.t, self.turn, self.G
+        t, turn, turned_by_rate = self.t, self.turn, self.G
         # at samples of the rate: carried on from the last event, or between events
         interval_s = float(np.median(np.diff(turn.t), overwrite_input=True))
         every = max(1, round(1.0 / (LARGEST_RATE_HZ * interval_s)))
         rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))[::every]
         s = turn.t[rows]
         last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
-        dt, dG = s - t[last], G[rows] - self.at[last]
+        dt, turned_since = s - t[last], turned_by_rate[rows] - self.at[last]
         psi, scale, bias = (causal[last, state] for state in (ANGLE, SCALE, BIAS))
-        carried = psi + (1 + scale) * dG - bias * dt
+        carried = psi + (1 + scale) * turned_since - bias * dt
         variance = noises["angle"] ** 2 * dt
-        f = {ANGLE: np.ones(len(rows)), BIAS: -dt, SCALE: dG}
+        f = {ANGLE: np.ones(len(rows)), BIAS: -dt, SCALE: turned_since}
         for i, j in product(f, f):
             variance += f[i] * of_causal[last, i, j] * f[j]
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
         gain = 1 + states[-1, SCALE]
-        smoothed = gain * G[rows] + np.interp(s, t, states[:, ANGLE] - gain * self.at)
+        smoothed = gain * turned_by_rate[rows] + np.interp(s, t, states[:, ANGLE] - gain * self.at)
         # a rate may be the mean over the interval before its stamp, or after it
         delay_s = interval_s / 2.0 if turn.delay_std_s is None else turn.delay_std_s
         stamp = (turn.rate[rows] * delay_s) ** 2

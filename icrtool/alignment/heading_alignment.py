@@ -66,7 +66,7 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
         return NO_NAME
     declination = _declination_deg(datum, stamp_ns) if datum is not None else None
     convergence = utm_convergence_deg(datum) if datum is not None else None
-    norths, found = [("", 0.0)], []
+    norths, causes = [("", 0.0)], []
     for what, angle_deg in (("magnetic declination", declination), ("UTM grid convergence", convergence)):
         if angle_deg is not None and abs(angle_deg) > math.degrees(SMALLEST_NAME_RAD):
             norths.append((f"{what} here is {angle_deg:+z.1f}°", math.radians(angle_deg)))
@@ -76,8 +76,8 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
             texts = [text for text in (turn_text, north_text) if text]
             if away <= max(LIKE_RAD, 2.0 * sigma_rad) and texts:
                 # Fewer causes are more likely; of equally many, the closest ones.
-                found.append((len(texts), away, " and ".join(texts)))
-    return OffsetName(min(found)[2] if found else "", declination, convergence)
+                causes.append((len(texts), away, " and ".join(texts)))
+    return OffsetName(min(causes)[2] if causes else "", declination, convergence)
 
 
 def utm_convergence_deg(datum: Datum) -> float | None:
@@ -251,21 +251,26 @@ def align_heading(
 
 
 def _correction(
-    log: RobotLog, config: Config, fit: AlignmentFit, convention: Convention, found: tuple[float, float], fixed: float
+    log: RobotLog,
+    config: Config,
+    fit: AlignmentFit,
+    convention: Convention,
+    estimate: tuple[float, float],
+    configured: float,
 ) -> tuple[float, OffsetName, list[Note]]:
     """Return the angle to subtract from a stated heading [rad], the cause of its offset, and findings.
 
     Parameters
     ----------
-    found : offset and its standard deviation [rad]; fixed : configured angle to subtract [rad]
+    estimate : offset and its standard deviation [rad]; configured : configured angle to subtract [rad]
     """
-    offset, std = found
+    offset, std = estimate
     mirrored, corrects = convention.heading < 0, config.filter.rules.corrects
     pose_mirrored = mirrored and convention.position < 0 and fit.windows.track.same_clock
     text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
-    significant = _significant(offset - fixed, std)
+    significant = _significant(offset - configured, std)
     applies = config.frames.heading_offset_deg == "auto" and corrects
-    applied = offset if applies and (mirrored or significant) else fixed
+    applied = offset if applies and (mirrored or significant) else configured
     notes = list[Note]()
     if mirrored and not corrects:
         notes.append(OTHER_CONVENTION)
@@ -279,7 +284,7 @@ def _correction(
     elif significant and applies:
         notes.append(_offset_note(text, applied))
     elif significant:
-        why = f"heading is {text} off the course over ground; {-math.degrees(fixed):+z.1f}° is applied"
+        why = f"heading is {text} off the course over ground; {-math.degrees(configured):+z.1f}° is applied"
         notes.append(note("heading_offset_differs", why))
     return applied, name, notes
 

@@ -94,7 +94,7 @@ better."""
 TURNS_COMPARED_S = 1.0
 """Time over which the turns of gyro and wheels are compared [s]."""
 
-LEFT_SHARE = 0.3
+RESIDUAL_SHARE = 0.3
 """Largest scatter of the gyro's turns about the wheels' turns, as a share of the rms turn, at which both agree. A
 conflict with the course over ground is then attributed to the fixes."""
 
@@ -151,19 +151,19 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             log.name, "no heading in it, and too few wheel or position samples", "record at least two of each"
         )
     track = track_of_log(log)
-    found = _with_gyro(log, track, None)
-    alive = found is not None and found.estimate.noises["angle"] < LARGEST_DRIFT
-    if found is not None and (alive or _follows_wheels(found, track, width_m, log)):
-        return found
+    by_gyro = _with_gyro(log, track, None)
+    alive = by_gyro is not None and by_gyro.estimate.noises["angle"] < LARGEST_DRIFT
+    if by_gyro is not None and (alive or _follows_wheels(by_gyro, track, width_m, log)):
+        return by_gyro
     why = "no turn rate in the log"
-    if found is not None:
+    if by_gyro is not None:
         why = "the turn rate drifts more"
     elif log.gyros:
         why = "the turn rate does not cover enough of the drive"
     by_wheels = _derived(log, track, wheel_rate(track, width_m), None, None, instead=why)
-    if by_wheels is not None and (found is None or by_wheels.estimate.median_std < found.estimate.median_std):
+    if by_wheels is not None and (by_gyro is None or by_wheels.estimate.median_std < by_gyro.estimate.median_std):
         return by_wheels
-    if found is None:
+    if by_gyro is None:
         refuse_standing(log)
         raise DataError(
             log.name,
@@ -171,7 +171,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             f"±{track.place_std_m:.2f} m",
             "record an orientation (AHRS), use RTK, or drive several times as far",
         )
-    return found
+    return by_gyro
 
 
 def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
@@ -186,10 +186,10 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
     """
     if track.same_clock:
         return None
-    found = _with_gyro(log, track, log.heading)
-    if found is None or found.estimate.noises["angle"] >= LARGEST_DRIFT:
+    fused = _with_gyro(log, track, log.heading)
+    if fused is None or fused.estimate.noises["angle"] >= LARGEST_DRIFT:
         return None
-    return found if found.estimate.median_std <= math.hypot(found.estimate.noises[WANDERS], ATTITUDE_STD_RAD) else None
+    return fused if fused.estimate.median_std <= math.hypot(fused.estimate.noises[WANDERS], ATTITUDE_STD_RAD) else None
 
 
 def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: RobotLog) -> bool:
@@ -199,8 +199,8 @@ def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: 
     t = (derived.gyro.stamp_ns - int(log.wheels.stamp_ns[0])) / 1e9
     by_gyro = track._replace(heading_t=t, heading=trapezoids(t, derived.gyro.rate_radps), measured_t=None)
     return any(
-        found.left_rad < LEFT_SHARE * found.turn_rad and LEAST_GAIN < found.ratio < LARGEST_GAIN
-        for found in compare_turns(by_gyro, width_m, 0.0, (TURNS_COMPARED_S,))
+        comparison.residual_rad < RESIDUAL_SHARE * comparison.turn_rad and LEAST_GAIN < comparison.ratio < LARGEST_GAIN
+        for comparison in compare_turns(by_gyro, width_m, 0.0, (TURNS_COMPARED_S,))
     )
 
 
@@ -208,17 +208,17 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
     """Return the estimate with the gyro that follows the courses over ground best; None where none covers them."""
     if not log.gyros:
         return None
-    best, least, changes, epoch = None, math.inf, course_changes(track), int(log.wheels.stamp_ns[0])
+    best_heading, least, changes, epoch = None, math.inf, course_changes(track), int(log.wheels.stamp_ns[0])
     for gyro in log.gyros:
         rates = gyro_rates(track, changes, gyro, epoch)
         # with a stated heading, which would fit to either sense of a turn rate, only the usual mounting is tried
         for row, (turn, axis) in enumerate(rates if stated is None else rates[:1]):
-            found = _derived(log, track, turn, gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})", stated)
-            std = math.inf if found is None else found.estimate.median_std
+            candidate = _derived(log, track, turn, gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})", stated)
+            std = math.inf if candidate is None else candidate.estimate.median_std
             std *= 1.0 if row else BETTER_SCATTER_RATIO
             if std < least:
-                best, least = found, std
-    return best
+                best_heading, least = candidate, std
+    return best_heading
 
 
 def _derived(
@@ -235,12 +235,12 @@ def _derived(
     if stated is not None:
         # with the white noise that it shows relative to the turn rate
         measured = track.seen_heading_t
-        one = _averaged(measured, track.heading_at(measured), turn, ATTITUDE_CELL_S)
-        step = np.diff(one.heading - np.interp(one.t, turn.t, turn.integrated))
+        attitude_cells = _averaged(measured, track.heading_at(measured), turn, ATTITUDE_CELL_S)
+        step = np.diff(attitude_cells.heading - np.interp(attitude_cells.t, turn.t, turn.integrated))
         noise = mad_std(wrapped(step - np.median(step))) / math.sqrt(2.0) if len(step) else 0.0
-        std = np.full(len(one.t), max(noise, LEAST_ATTITUDE_STD_RAD))
+        std = np.full(len(attitude_cells.t), max(noise, LEAST_ATTITUDE_STD_RAD))
         topic = log.topic("heading", "orientation")
-        absolute.append(one._replace(std=std, aligned_std=ATTITUDE_STD_RAD, topic=topic, part="orientation"))
+        absolute.append(attitude_cells._replace(std=std, aligned_std=ATTITUDE_STD_RAD, topic=topic, part="orientation"))
     bearing = antenna_bearing(log, turn)
     absolute += [bearing] if bearing is not None else []
     estimate = estimate_heading(track, turn, absolute, stands=gyro_topic is not None)
@@ -262,12 +262,12 @@ def _derived(
     causal, smoothed = wrapped(estimate.causal), wrapped(estimate.smoothed)
     # the causal heading begins where it is known, and again after a hole of the turn rate
     std = estimate.causal_std
-    known = known_again(estimate.t, std, turn.holes)
+    clear = known_again(estimate.t, std, turn.holes)
     return DerivedHeading(
         source,
         " + ".join(names),
         estimate,
-        HeadingSamples(stamps[known], causal[known], std[known] ** 2),
+        HeadingSamples(stamps[clear], causal[clear], std[clear] ** 2),
         HeadingSamples(stamps, smoothed, estimate.smoothed_std**2),
         GyroSamples(gyro_topic, turn_stamps, turn.rate) if gyro_topic else None,
         attitude,
@@ -285,14 +285,14 @@ def known_again(t: Floats, std: Floats, holes: Floats) -> Bools:
     t : (n,) [s]; std : (n,) [rad]; holes : (m, 2) [s]
     """
     clear = std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(std)))
-    known, found = np.ones(len(t), np.bool_), np.flatnonzero(clear)
+    is_known, clear_rows = np.ones(len(t), np.bool_), np.flatnonzero(clear)
     for begin, until in ((-math.inf, -math.inf), *holes.tolist()):
         first = int(np.searchsorted(t, begin, side="right"))
-        after = int(np.searchsorted(found, max(first, int(np.searchsorted(t, until)))))
-        if after < len(found) or math.isfinite(begin):
-            unclear = slice(first, found[after] if after < len(found) else None)
-            known[unclear] &= clear[unclear]
-    return known
+        after = int(np.searchsorted(clear_rows, max(first, int(np.searchsorted(t, until)))))
+        if after < len(clear_rows) or math.isfinite(begin):
+            unclear = slice(first, clear_rows[after] if after < len(clear_rows) else None)
+            is_known[unclear] &= clear[unclear]
+    return is_known
 
 
 def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog | None:
@@ -319,11 +319,11 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
     )
     bare = replace(without_heading(log, why), gyros=(*log.gyros, gyro))
     try:
-        found = derive_heading(bare, width_m)
+        derived = derive_heading(bare, width_m)
     except DataError:
         return None
-    std = found.estimate.median_std
-    return bare if found.source != "wheels_course" and std < min(scatter_rad / 2, NOISY_SCATTER_RAD) else None
+    std = derived.estimate.median_std
+    return bare if derived.source != "wheels_course" and std < min(scatter_rad / 2, NOISY_SCATTER_RAD) else None
 
 
 def without_heading(log: RobotLog, why: str) -> RobotLog:

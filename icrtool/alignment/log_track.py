@@ -158,13 +158,13 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     where they are rare; `FixSteps.white_std_m` leaves the motion out.
     """
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
-    known = variance[np.isfinite(variance) & (variance > 0)]
-    stated = math.sqrt(float(np.median(known))) if len(known) else USUAL_POSITION_STD_M
+    known_variance = variance[np.isfinite(variance) & (variance > 0)]
+    stated = math.sqrt(float(np.median(known_variance))) if len(known_variance) else USUAL_POSITION_STD_M
     if len(gnss.stamp_ns) < FEWEST_FIXES:
         return stated
     bend = np.sqrt(np.diff(gnss.north_m, 2) ** 2 + np.diff(gnss.east_m, 2) ** 2)
-    seen = float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
-    return seen if seen > NOISIER * stated else stated
+    measured = float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
+    return measured if measured > NOISIER * stated else stated
 
 
 def windows_of_log(log: RobotLog, width_m: float, heading: HeadingSamples | None = None) -> DriveWindows:
@@ -194,9 +194,9 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
     covers = [track.t, track.heading_t] if len(track.heading_t) else [track.t]
     first, last = max(t[0] for t in covers), min(t[-1] for t in covers)
     t, at = track.place_t, track.distance
-    whole = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_ALIGNMENT_WINDOW_S)
-    whole &= at[end] - at[begin] < 2.0 * length
-    begin, end, lengths = begin[whole], end[whole], windows.length_m[whole]
+    usable = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_ALIGNMENT_WINDOW_S)
+    usable &= at[end] - at[begin] < 2.0 * length
+    begin, end, lengths = begin[usable], end[usable], windows.length_m[usable]
     # windows of time in which wheels and heading were sampled and the wheels turned
     turn_begin = turn_end = np.empty(0)
     sampled = track.seen_heading_t
@@ -211,10 +211,10 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
             turn_begin, turn_end = spans_of_measured(sampled, TURN_WINDOW_S, round(TURN_WINDOW_IN_INTERVALS))
             near = turn_end - turn_begin < LONGEST_ALIGNMENT_WINDOW_S
             turn_begin, turn_end = turn_begin[near], turn_end[near]
-        whole = (turn_begin >= first) & (turn_end <= last) & track.clear(turn_begin, turn_end)
-        whole &= np.searchsorted(sampled, turn_end) > np.searchsorted(sampled, turn_begin) + 1
-        whole &= np.interp(turn_end, track.t, travel) > np.interp(turn_begin, track.t, travel)
-        turn_begin, turn_end = turn_begin[whole], turn_end[whole]
+        usable = (turn_begin >= first) & (turn_end <= last) & track.clear(turn_begin, turn_end)
+        usable &= np.searchsorted(sampled, turn_end) > np.searchsorted(sampled, turn_begin) + 1
+        usable &= np.interp(turn_end, track.t, travel) > np.interp(turn_begin, track.t, travel)
+        turn_begin, turn_end = turn_begin[usable], turn_end[usable]
     # windows that count as one independent observation: 10 windows, where there are 40 of them
     size = min(max(float(travel[-1]) / 40.0, 2.0 * length), 10.0 * length)
     turn_travel = np.interp(turn_begin, track.t, travel)
@@ -281,8 +281,8 @@ def check_streams(log: RobotLog) -> None:
         if len(stamps) < 2:
             raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
         back = stamps < np.append(stamps[:1], stamps[:-1])
-        bad = np.logical_or.reduce([~np.isfinite(one) for one in values])
-        negative = np.logical_or.reduce([np.zeros(len(stamps), np.bool_), *(one < 0 for one in variances)])
+        bad = np.logical_or.reduce([~np.isfinite(values_of) for values_of in values])
+        negative = np.logical_or.reduce([np.zeros(len(stamps), np.bool_), *(values_of < 0 for values_of in variances)])
         count = np.count_nonzero(bad)
         for rows, fault, advice in (
             (back, f"the {what} stamps go back at row", "sort the rows by stamp"),
@@ -291,13 +291,13 @@ def check_streams(log: RobotLog) -> None:
         ):
             if rows.any():
                 raise DataError(log.name, f"{fault} {rows.argmax()}", advice)
-    fastest = max(np.abs(one).max() for one in (wheels.left, wheels.right))
-    farthest = max(np.abs(one).max() for one in (gnss.north_m, gnss.east_m))
+    fastest = max(np.abs(values_of).max() for values_of in (wheels.left, wheels.right))
+    farthest = max(np.abs(values_of).max() for values_of in (gnss.north_m, gnss.east_m))
     if fastest >= IMPOSSIBLE_MPS:
         raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")
     if farthest >= IMPOSSIBLE_M:
         raise DataError(log.name, f"a position {farthest:.2g} m from the origin", "is it in its unit?")
     spans = {"wheel": wheels.stamp_ns, "position": gnss.stamp_ns, "heading": heading.stamp_ns}
     if max(int(s[0]) for s in spans.values()) >= min(int(s[-1]) for s in spans.values()):
-        found = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in spans.items())
-        raise DataError(log.name, "wheels, position and heading do not overlap in time", found)
+        spans_text = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in spans.items())
+        raise DataError(log.name, "wheels, position and heading do not overlap in time", spans_text)

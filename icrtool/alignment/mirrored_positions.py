@@ -45,31 +45,31 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
     width = width_or_usual_m(config.robot.track_width_m)
     moved, inner, _ = with_configured_delays(log, config)
     try:
-        named = with_wheel_speeds(moved, inner)
+        with_speeds = with_wheel_speeds(moved, inner)
         if by_gyro:
-            named = _with_turned_heading(named)
-        check_streams(named)
+            with_speeds = _with_turned_heading(with_speeds)
+        check_streams(with_speeds)
     except (ConfigError, DataError):
         # it is refused later, with its reason
         return log
-    windows = windows_of_log(named, width)
+    windows = windows_of_log(with_speeds, width)
     if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return log
     as_sent = NamedFit.of(windows)
-    if as_sent.turn_sigmas < WITNESS_SIGMAS or (not by_gyro and gyro_sense(named, windows.track) <= 0):
+    if as_sent.turn_sigmas < WITNESS_SIGMAS or (not by_gyro and gyro_sense(with_speeds, windows.track) <= 0):
         return log
-    found = []
+    candidates = []
     for words, one in _exchanges(log):
         fixes = one.gnss
         track = windows.track._replace(north=fixes.north_m, east=fixes.east_m)
-        found.append((NamedFit.of(replace(windows, track=track)), words, one))
-    scatter = min((fit.scatter for fit, _, _ in found), default=0.0)
+        candidates.append((NamedFit.of(replace(windows, track=track)), words, one))
+    scatter = min((fit.scatter for fit, _, _ in candidates), default=0.0)
     scatter = max(scatter, 0.5 * windows.track.place_std_m / float(windows.length_m[0]))
-    costs = [fit.cost(scatter) for fit, _, _ in found]
+    costs = [fit.cost(scatter) for fit, _, _ in candidates]
     gain = as_sent.cost(scatter) - min(costs, default=math.inf)
     if not gain > DECISIVE:
         return log
-    near = [one for one, cost in zip(found, costs, strict=True) if cost < min(costs) + DECISIVE]
+    near = [one for one, cost in zip(candidates, costs, strict=True) if cost < min(costs) + DECISIVE]
     if by_gyro:
         # no heading decides between exchanges that fit alike: the path is the same, turned as a whole
         what, right = " or ".join(words for _, words, _ in near), near[0][2]

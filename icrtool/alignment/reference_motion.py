@@ -156,9 +156,9 @@ class ComparedWindows(NamedTuple):
         """Motion of the left and of the right side by the model (2, w) [m]."""
         return np.stack([self.model_ahead + self.model_turned, self.model_ahead - self.model_turned])
 
-    def rows(self, kept: Bools | slice) -> ComparedWindows:
+    def rows(self, rows: Bools | slice) -> ComparedWindows:
         """Return some of the windows."""
-        return ComparedWindows._make(column[kept] for column in self)
+        return ComparedWindows._make(column[rows] for column in self)
 
 
 def lay_knots(sensors: SensorData) -> Knots | None:
@@ -179,8 +179,8 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     track = track.places(rows)
     t = track.place_t
     v_left, v_right = (
-        (np.interp(t + SPEED_S / 2, track.t, gone) - np.interp(t - SPEED_S / 2, track.t, gone)) / SPEED_S
-        for gone in (track.cumulate(left), track.cumulate(right))
+        (np.interp(t + SPEED_S / 2, track.t, travelled) - np.interp(t - SPEED_S / 2, track.t, travelled)) / SPEED_S
+        for travelled in (track.cumulate(left), track.cumulate(right))
     )
     heading = track.heading_at(t)
     of_wheels, *of_others = (_in_hole(sampled, t) for sampled in (track.t, track.seen_heading_t, t))
@@ -224,14 +224,14 @@ def compare_by_duration(knots: Knots, motion: Motion) -> list[tuple[float, Compa
         needed = math.sqrt(2 * LEAST_DISTANCE2 * float(np.median(knots.variance)))
         while speed * durations[-1] < needed and durations[-1] < LONGEST_MOTION_WINDOW_S:
             durations.append(2 * durations[-1])
-    found = []
+    by_duration = []
     for duration_s in reversed(durations):
         last = np.searchsorted(knots.t, knots.t + duration_s - KNOT_S / 2)
         first = np.flatnonzero(last < len(knots.t))
         last = last[first]
-        whole = (last - first >= FEWEST_INTERVALS) & (knots.holes[first] == knots.holes[last])
-        found.append((duration_s, compare(knots, motion, first[whole], last[whole], RESPONSE_S)))
-    return found
+        usable = (last - first >= FEWEST_INTERVALS) & (knots.holes[first] == knots.holes[last])
+        by_duration.append((duration_s, compare(knots, motion, first[usable], last[usable], RESPONSE_S)))
+    return by_duration
 
 
 def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
@@ -246,9 +246,9 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     windows = cut_drive_windows(knots.track._replace(slipping=np.append(left_out, False)), MOTION_WINDOW_M)
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
     begin, end = np.searchsorted(knots.t, [windows.turn_begin, windows.turn_end]).clip(0, len(knots.t) - 1)
-    kept = (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])
-    turn_begin, turn_end = windows.turn_begin[kept], windows.turn_end[kept]
-    windows = replace(windows, turn_begin=turn_begin, turn_end=turn_end, turn_group=windows.turn_group[kept])
+    undisturbed = (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])
+    turn_begin, turn_end = windows.turn_begin[undisturbed], windows.turn_end[undisturbed]
+    windows = replace(windows, turn_begin=turn_begin, turn_end=turn_end, turn_group=windows.turn_group[undisturbed])
     fit = estimate_alignment(windows, width_m)
     if fit is None:
         return None
@@ -329,12 +329,12 @@ def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Ints]:
     """Return the knots without single outliers, and the rows before steps that may be jumps, which no window spans."""
     row = np.arange(len(knots.t))
     step, over = _beyond(knots, row[:-1], row[1:], width_m), _beyond(knots, row[:-2], row[2:], width_m)
-    kept = np.ones(len(row), np.bool_)
-    kept[1:-1] = ~(step[:-1] & step[1:] & ~over)
+    is_kept = np.ones(len(row), np.bool_)
+    is_kept[1:-1] = ~(step[:-1] & step[1:] & ~over)
     columns: dict[str, Any] = {
-        name: value[kept] for name, value in knots._asdict().items() if isinstance(value, np.ndarray)
+        name: value[is_kept] for name, value in knots._asdict().items() if isinstance(value, np.ndarray)
     }
-    knots = knots._replace(track=knots.track.places(kept), **columns)
+    knots = knots._replace(track=knots.track.places(is_kept), **columns)
     row = row[: len(knots.t)]
     first = np.flatnonzero(_beyond(knots, row[:-1], row[1:], width_m))
     holes = np.searchsorted(first, row - 1, side="right")

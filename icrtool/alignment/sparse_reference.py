@@ -46,16 +46,18 @@ def carried(track: Track) -> Track:
     if len(step) < FEWEST_CARRIED or not float(np.median(step)) > SPARSE_S:
         return track
     turned = np.interp(t, track.t, track.cumulate(2.0 * track.half_difference))
-    whole = (step < LONGEST_CARRIED_S) & (step > 0.0) & track.clear(t[:-1], t[1:])
+    usable = (step < LONGEST_CARRIED_S) & (step > 0.0) & track.clear(t[:-1], t[1:])
     apart, turn = np.diff(turned), wrapped(np.diff(heading))
-    ratio = _turn_per_m(apart[whole], turn[whole])
+    ratio = _turn_per_m(apart[usable], turn[usable])
     if ratio is None:
         return track
-    left = heading[0] + np.append(0.0, np.cumsum(np.where(whole, wrapped(turn - ratio * apart), turn - ratio * apart)))
+    remainder = heading[0] + np.append(
+        0.0, np.cumsum(np.where(usable, wrapped(turn - ratio * apart), turn - ratio * apart))
+    )
     inside = track.t[(track.t > t[0]) & (track.t < t[-1])]
     dense = np.union1d(t, inside)
     everywhere = np.interp(dense, track.t, track.cumulate(2.0 * track.half_difference)) - turned[0]
-    return track._replace(heading_t=dense, heading=np.interp(dense, t, left) + ratio * everywhere, measured_t=t)
+    return track._replace(heading_t=dense, heading=np.interp(dense, t, remainder) + ratio * everywhere, measured_t=t)
 
 
 def _turn_per_m(apart: Floats, turn: Floats) -> float | None:

@@ -157,27 +157,27 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
 
     turned = np.interp(t, turn.t, corrected)
     swing = np.exp(1j * turned)
-    whole = laid(step)
-    path = centred(whole - guess.x * swing)
+    laid_path = laid(step)
+    path = centred(laid_path - guess.x * swing)
     speed = v[np.clip(np.searchsorted(track.t, t, side="right") - 1, 0, len(v) - 1)]
     square = np.maximum(product(path).real, 1e-12)
-    seen = product(centred(place)) / square
+    displacement = product(centred(place)) / square
     unknown = guess.bias_std * (t[end] - t[begin]) + guess.scale_std * np.abs(turned[end] - turned[begin])
-    kept = (unknown < LARGEST_TURN_ERROR_RAD) & (np.abs(seen) > 0.3)
-    kept &= np.abs(whole[end] - whole[begin]) > 0.5 * length * (count - 1) / count
-    kept &= track.clear(t[begin], t[end])
-    kept &= np.searchsorted(turn.holes[:, 1], t[begin]) == np.searchsorted(turn.holes[:, 0], t[end])
+    usable = (unknown < LARGEST_TURN_ERROR_RAD) & (np.abs(displacement) > 0.3)
+    usable &= np.abs(laid_path[end] - laid_path[begin]) > 0.5 * length * (count - 1) / count
+    usable &= track.clear(t[begin], t[end])
+    usable &= np.searchsorted(turn.holes[:, 1], t[begin]) == np.searchsorted(turn.holes[:, 0], t[end])
     of_x, of_delay = (product(centred(-one)).imag / square for one in (swing, speed * swing))
     of_bias = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
     of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
     # about no bias, no x and no delay
     bias_at = np.interp(t[end], turn.t, guess.bias)
-    angle = np.angle(seen * swing[end]) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
-    found = Courses(
+    angle = np.angle(displacement * swing[end]) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
+    courses = Courses(
         t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, track.place_std_m / np.sqrt(square),
-        np.abs(seen), product(centred(laid(u * nose))).real / square,
+        np.abs(displacement), product(centred(laid(u * nose))).real / square,
     )  # fmt: skip
-    return Courses(*(values[kept] for values in found))
+    return Courses(*(values[usable] for values in courses))
 
 
 def fit_middle(courses: Courses, guess: Guess) -> float:
@@ -188,8 +188,8 @@ def fit_middle(courses: Courses, guess: Guess) -> float:
         mean_x, mean_y = np.average(x, weights=weights), np.average(y, weights=weights)
         spread = float((weights * (x - mean_x) ** 2).sum())
         slope = float((weights * (x - mean_x) * (y - mean_y)).sum()) / (spread + len(x) * MIDDLE_NOISE**2)
-        left = y - mean_y - slope * (x - mean_x)
-        weights = soft_l1_weights(left / max(mad_std(left, 0.0), 1e-6))
+        residuals = y - mean_y - slope * (x - mean_x)
+        weights = soft_l1_weights(residuals / max(mad_std(residuals, 0.0), 1e-6))
     return guess.middle + slope
 
 
@@ -201,12 +201,12 @@ def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
     along = track.cumulate(track.mean_speed)
     length, t, place, begin, end = _cut_courses(track, float(track.t[0]), float(track.t[-1]))
     went = np.interp(t[end], track.t, along) - np.interp(t[begin], track.t, along)
-    seen = (place[end] - place[begin]) * np.sign(went)
-    kept = (np.abs(went) > 0.3 * length) & (np.abs(seen) > 0.3 * np.abs(went))
-    kept &= t[end] - t[begin] < LONGEST_STRETCH_S
-    middle, seen = ((t[begin] + t[end]) / 2)[kept], seen[kept]
+    displacement = (place[end] - place[begin]) * np.sign(went)
+    usable = (np.abs(went) > 0.3 * length) & (np.abs(displacement) > 0.3 * np.abs(went))
+    usable &= t[end] - t[begin] < LONGEST_STRETCH_S
+    middle, displacement = ((t[begin] + t[end]) / 2)[usable], displacement[usable]
     near = np.diff(middle) < LONGEST_STRETCH_S
-    return middle[:-1][near], middle[1:][near], np.angle(seen[1:] * np.conj(seen[:-1]))[near]
+    return middle[:-1][near], middle[1:][near], np.angle(displacement[1:] * np.conj(displacement[:-1]))[near]
 
 
 def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Floats, Complexes, Ints, Ints]:
@@ -297,11 +297,11 @@ def gyro_rates(
     angles = [trapezoids(t, rate) for rate in gyro.rates_radps.T]
     turned = np.column_stack([np.interp(end, t, angle) - np.interp(begin, t, angle) for angle in angles])
     small = np.abs(turned).max(axis=1) < LARGEST_CHANGE_RAD
-    found = None
+    by_courses = None
     if np.count_nonzero(small) >= 6:
-        found = _axis_by_courses(turned[small], (end - begin)[small], change[small])
-    axes = [(Z_UP, "z up")] if found is None else [found]
-    if found is None and (about := _main_axis(turned, end - begin, change)) is not None:
+        by_courses = _axis_by_courses(turned[small], (end - begin)[small], change[small])
+    axes = [(Z_UP, "z up")] if by_courses is None else [by_courses]
+    if by_courses is None and (about := _main_axis(turned, end - begin, change)) is not None:
         axes += [_named(about), _named(-about)]
     return [(_bridged(t, gyro.rates_radps @ axis, track), name) for axis, name in axes]
 
@@ -321,13 +321,13 @@ def _axis_by_courses(turned: Floats, seconds: Floats, change: Floats) -> tuple[F
     ----------
     turned : (m, 3) turn about each axis; seconds : (m,) over which; change : (m,) of the course over ground [rad]
     """
-    found = robust_regression(np.column_stack([turned, seconds]), change, AXIS_PRIOR_STD).x
-    size = float(np.linalg.norm(found[:3]))
+    solution = robust_regression(np.column_stack([turned, seconds]), change, AXIS_PRIOR_STD).x
+    size = float(np.linalg.norm(solution[:3]))
     if size <= LEAST_AXIS:
         return None
-    axis, name = _named(found[:3] / size)
-    left = change[:, None] - found[3] * seconds[:, None] - turned @ np.column_stack([axis, Z_UP])
-    scatter = np.abs(wrapped(left)).mean(axis=0)
+    axis, name = _named(solution[:3] / size)
+    residuals = change[:, None] - solution[3] * seconds[:, None] - turned @ np.column_stack([axis, Z_UP])
+    scatter = np.abs(wrapped(residuals)).mean(axis=0)
     return (axis, name) if name == "z up" or scatter[0] < BETTER_SCATTER_RATIO * scatter[1] else None
 
 
@@ -357,17 +357,17 @@ def _bridged(t: Floats, rate: Floats, track: Track) -> TurnRate:
     apart = track.v_left - track.v_right
     there = np.interp(track.t, t, rate)
     hole = np.searchsorted(holes[:, 0], track.t) > np.searchsorted(holes[:, 1], track.t, side="right")
-    known = ~hole & (track.t >= t[0]) & (track.t <= t[-1])
-    factor = float(apart[known] @ there[known]) / max(float(apart[known] @ apart[known]), 1e-12)
-    left = there[known] - factor * apart[known]
+    measured = ~hole & (track.t >= t[0]) & (track.t <= t[-1])
+    factor = float(apart[measured] @ there[measured]) / max(float(apart[measured] @ apart[measured]), 1e-12)
+    residuals = there[measured] - factor * apart[measured]
     wheels = hole & (track.held > 0.0)
     order = np.argsort(np.concatenate([t, track.t[wheels]]), kind="stable")
     # in a hole that the wheels do not cover either, the robot may turn as it does elsewhere
     covered_s = np.interp(holes, track.t, np.concatenate([[0.0], np.cumsum(track.held[:-1])])) @ [-1.0, 1.0]
     covered = covered_s > COVERED_SHARE * (holes[:, 1] - holes[:, 0])
-    by_wheels = float(np.sqrt(np.mean(left**2))) if len(left) else LEAST_HOLE_STD_RADPS
+    by_wheels = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else LEAST_HOLE_STD_RADPS
     return TurnRate(
         np.concatenate([t, track.t[wheels]])[order],
-        np.concatenate([rate, factor * apart[wheels] + float(np.median(left))])[order],
+        np.concatenate([rate, factor * apart[wheels] + float(np.median(residuals))])[order],
         holes, hole_std=np.where(covered, by_wheels, _any_rate_std(rate)),
     )  # fmt: skip

@@ -76,12 +76,14 @@ def configured_scales(config: Config) -> tuple[float, float]:
     return 1.0 if left == "auto" else left, 1.0 if right == "auto" else right
 
 
-def scaled(log: RobotLog, left: float, right: float) -> RobotLog:
+def scaled(log: RobotLog, left_factor: float, right_factor: float) -> RobotLog:
     """Return the log with the speeds of its sides multiplied; the same log where both factors are 1."""
-    if left == right == 1.0:
+    if left_factor == right_factor == 1.0:
         return log
     wheels = log.wheels
-    return replace(log, wheels=replace(wheels, left=left * wheels.v_left_mps, right=right * wheels.v_right_mps))
+    return replace(
+        log, wheels=replace(wheels, left=left_factor * wheels.v_left_mps, right=right_factor * wheels.v_right_mps)
+    )
 
 
 def _contradicted(wheels: WheelSamples, fixes: Fixes) -> Bools:
@@ -188,7 +190,7 @@ def align_wheels(
         notes.append(note("wheel_values_held", why))
     scale, std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
     windows = 0 if fit is None else len(fit.windows.begin)
-    turn_left, turn_left_std = (math.nan, math.nan) if fit is None else turn_variance_left(fit)
+    turn_unexplained, turn_unexplained_std = (math.nan, math.nan) if fit is None else unexplained_turn_variance(fit)
     facts = WheelFacts(
         scale=known(scale),
         scale_std=known(std),
@@ -200,8 +202,8 @@ def align_wheels(
         windows=windows,
         stretches=0 if fit is None else len(np.union1d(fit.windows.group, fit.windows.turn_group)),
         residual_m=None if fit is None else known(math.hypot(*fit.fit.scale[[0, windows]].tolist())),
-        turn_left=known(turn_left),
-        turn_left_std=known(turn_left_std),
+        turn_unexplained=known(turn_unexplained),
+        turn_unexplained_std=known(turn_unexplained_std),
         ground_change_s=None if change is None else change.times_s[0],
         ground_stretches=() if change is None else change.stretches,
     )
@@ -209,7 +211,7 @@ def align_wheels(
     return facts, applied, [*notes, *_fused_note(log, config.wheels.twist_width_m or config.robot.track_width_m)]
 
 
-def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
+def unexplained_turn_variance(fit: AlignmentFit) -> tuple[float, float]:
     """Return the share of the variance of the turns that the wheels do not explain, 1 - R^2, and its deviation.
 
     Notes
@@ -217,15 +219,15 @@ def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
     The deviation comes from a jackknife over stretches of distance (Efron and Stein 1981). NaN without two stretches
     that turn.
     """
-    of = residuals_by_estimate(fit)
+    residuals = residuals_by_estimate(fit)
     groups, row = np.unique(fit.windows.turn_group, return_inverse=True)
-    left, turned = (np.bincount(row, one**2, len(groups)) for one in (of.turn_after, of.turn_rad))
+    unexplained, turned = (np.bincount(row, one**2, len(groups)) for one in (residuals.turn_after, residuals.turn_rad))
     if len(groups) < 2 or not (turned > 0.0).sum() >= 2:
         return math.nan, math.nan
-    without = (left.sum() - left) / (turned.sum() - turned)
+    without = (unexplained.sum() - unexplained) / (turned.sum() - turned)
     count = len(groups)
     std = math.sqrt((count - 1) * float(np.mean((without - without.mean()) ** 2)))
-    return float(left.sum() / turned.sum()), std
+    return float(unexplained.sum() / turned.sum()), std
 
 
 def _find_scales(
@@ -242,15 +244,15 @@ def _find_scales(
         apart = f"their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
         slip = f"over {fit.windows.length_m[0]:.0f} m {apart}, their turns by {100 * fit.turn_slip:.0f} %"
         return (1.0, 1.0), [note("wheels_slip", f"the wheels slip: {slip}; no scale and no delay is corrected")]
-    given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
-    may = config.filter.rules.corrects and sound and not given
+    configured = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
+    may = config.filter.rules.corrects and sound and not configured
     factor, notes = 1.0, list[Note]()
     scale, std = fit.estimate("scale")
-    error, kept = abs(scale - 1.0), USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
+    error, weight = abs(scale - 1.0), USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
     # twice the log-likelihood with a free scale, minus twice the log-likelihood with scale 1
-    if std <= LARGEST_SCALE_STD and (error / std) ** 2 * kept + math.log1p(-kept) > 0.0:
+    if std <= LARGEST_SCALE_STD and (error / std) ** 2 * weight + math.log1p(-weight) > 0.0:
         if small := error <= LARGEST_SCALE_CORRECTION:
-            scale = 1.0 + (scale - 1.0) * kept
+            scale = 1.0 + (scale - 1.0) * weight
         text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
         check = f"{radius_hint(log, config, scale)}wheel radius, encoder resolution and units"
         if may and small:
@@ -269,8 +271,8 @@ def _find_scales(
     difference, std = asymmetry / turn, math.hypot(asymmetry_std, asymmetry * turn_std / turn) / turn
     if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, EVIDENCE_SIGMAS * std):
         return (factor, factor), notes
-    side, other = ("left", "right") if difference < 0 else ("right", "left")
-    text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other} one"
+    side, other_side = ("left", "right") if difference < 0 else ("right", "left")
+    text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other_side} one"
     text = f"{text} where both report the same distance"
     if not may:
         return (factor, factor), [*notes, note("side_scale_differs", f"{text}: check wheel radii and tyre pressures")]
@@ -315,12 +317,12 @@ class Turns(NamedTuple):
     Attributes
     ----------
     ratio, ratio_std : turn of the heading per turn of the wheels
-    left_rad : robust scatter of the heading's turn about this ratio; turn_rad : rms turn of the heading
+    residual_rad : robust scatter of the heading's turn about this ratio; turn_rad : rms turn of the heading
     """
 
     ratio: float
     ratio_std: float
-    left_rad: float
+    residual_rad: float
     turn_rad: float
 
 
@@ -332,7 +334,7 @@ def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Seque
     width_m : the track width b
     delay_s : lag of the heading behind the wheels
     """
-    t, travel, found = track.t, track.travel, list[Turns]()
+    t, travel, comparisons = track.t, track.travel, list[Turns]()
     turned = track.cumulate(2.0 * track.half_difference / width_m)
     for window_s in windows_s:
         first, last = max(t[0] + delay_s, track.heading_t[0]), min(t[-1] + delay_s, track.heading_t[-1])
@@ -349,15 +351,15 @@ def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Seque
             for shift, times, angle in ((delay_s, t, turned), (0.0, track.heading_t, track.heading))
         )
         moved = np.interp(end - delay_s, t, travel) > np.interp(begin - delay_s, t, travel)
-        kept = np.flatnonzero(track.clear(begin - delay_s, end - delay_s) & moved)
-        by_wheels, by_heading = by_wheels[kept], by_heading[kept]
-        if len(np.unique(a_span[kept])) < FEWEST_SPANS or not by_wheels.any():
+        usable = np.flatnonzero(track.clear(begin - delay_s, end - delay_s) & moved)
+        by_wheels, by_heading = by_wheels[usable], by_heading[usable]
+        if len(np.unique(a_span[usable])) < FEWEST_SPANS or not by_wheels.any():
             return []
         fit = robust_regression(by_wheels[:, None], by_heading)
-        variance = sandwich_covariance(fit, a_span[kept])[0, 0]
+        variance = sandwich_covariance(fit, a_span[usable])[0, 0]
         turn = math.sqrt(float(np.mean(by_heading**2)))
-        found.append(Turns(float(fit.x[0]), math.sqrt(float(variance)), float(fit.scale[0]), turn))
-    return found
+        comparisons.append(Turns(float(fit.x[0]), math.sqrt(float(variance)), float(fit.scale[0]), turn))
+    return comparisons
 
 
 NOISE_S, SHORT_S, MIDDLE_S, LONGEST_S = 0.3, 1.0, 5.0, 40.0
@@ -399,15 +401,15 @@ def find_filtering(fit: AlignmentFit) -> str:
     if long_s < SHORTEST_LONG_S / MIDDLE_S * middle_s:
         # the reference does not resolve the turns of a filter
         return ""
-    found = compare_turns(track, fit.width_m, delay, (noise_s, short_s, middle_s, long_s))
-    if not found:
+    comparisons = compare_turns(track, fit.width_m, delay, (noise_s, short_s, middle_s, long_s))
+    if not comparisons:
         return ""
-    noise, short, middle, long = found
+    noise, short, middle, long = comparisons
     change, std = long.ratio - short.ratio, math.hypot(short.ratio_std, long.ratio_std)
     if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(EVIDENCE_SIGMAS * std, SMALLEST_CHANGE * long.ratio):
         ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {short_s:g} s and {long.ratio:.2f} ± "
         return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of what they show"
-    at_middle, at_end = (math.sqrt(max(one.left_rad**2 - noise.left_rad**2, 0.0)) for one in (middle, long))
+    at_middle, at_end = (math.sqrt(max(one.residual_rad**2 - noise.residual_rad**2, 0.0)) for one in (middle, long))
     least = max(LARGE_SHARE * short.turn_rad, LARGE_RAD)
     if at_middle > least and at_end < BOUNDED * at_middle:
         angles = f"{math.degrees(at_middle):.0f}° over {middle_s:g} s and by no more than {math.degrees(at_end):.0f}°"

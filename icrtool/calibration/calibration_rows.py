@@ -14,9 +14,9 @@ from icrtool.calibration.held_sensors import (
     LEARNED,
     constants_document,
     contradictions,
-    left_of,
     measured_in,
     pooled_constants,
+    remaining_constants,
     words_of,
 )
 from icrtool.calibration.pooled import model_for
@@ -86,18 +86,18 @@ def calibrated_drive(
     sensors = HeldSensors(constants_document(total), measured, refit_sensors)
     names = [name for name in CONSTANT_WORDS if with_gyro or not name.startswith("gyro")]
     if refit_sensors:
-        own = own_constants(cut_windows(recording), fitted, recording.width_m)
+        own_values = own_constants(cut_windows(recording), fitted, recording.width_m)
         knows = f"{words_of(names)} refitted in this drive (--refit-sensors)"
-        return CalibratedDrive(KnownDrive(recording, (_learned(fitted, own),)), sensors, knows, ())
-    left = left_of(total, recording.corrected)
+        return CalibratedDrive(KnownDrive(recording, (_learned(fitted, own_values),)), sensors, knows, ())
+    remaining = remaining_constants(total, recording.corrected)
     unknown = [name for name in names if getattr(sensors.held, name) is None]
     # a model without a gyro uses no constants of it
-    constants = left.usual().mean
+    constants = remaining.usual().mean
     if unknown:
-        constants = own_constants(cut_windows(recording), fitted, recording.width_m, left.mean)
+        constants = own_constants(cut_windows(recording), fitted, recording.width_m, remaining.mean)
     learned: tuple[Learned, ...] = (_learned(fitted, constants),)
     if with_gyro:
-        usual = left.usual()
+        usual = remaining.usual()
         constants = constants._replace(gyro_bias_radps=usual.mean.gyro_bias_radps)
         learned = _with_biases(recording if past is None else past, fitted, constants, usual.std.gyro_bias_radps)
     knows = _knows([name for name in names if name not in unknown], unknown)

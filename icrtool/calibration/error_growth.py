@@ -81,20 +81,22 @@ class PathErrors(NamedTuple):
     of_sources: Spread
 
 
-def path_errors(windows: Windows, fitted: FittedModel, width_m: float, own: LogConstants = NO_CONSTANTS) -> PathErrors:
+def path_errors(
+    windows: Windows, fitted: FittedModel, width_m: float, constants: LogConstants = NO_CONSTANTS
+) -> PathErrors:
     """Return displacement and turn of windows by a model, and how errors of its parameters and of each source spread.
 
     Parameters
     ----------
-    own : constants of the recording
+    constants : constants of the recording
     """
     steps = windows.track
-    gyro = None if steps.gyro is None else steps.gyro + own.gyro_later_s * steps.gyro_change()
+    gyro = None if steps.gyro is None else steps.gyro + constants.gyro_later_s * steps.gyro_change()
     motion = wheel_motion(steps.v_left, steps.v_right, width_m, gyro)
     fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
-    fixed[OMEGA] += own.gyro_bias_radps
+    fixed[OMEGA] += constants.gyro_bias_radps
     # the sources act along the whole path, not only at the ends of the windows
-    of_start, of_end = (steps.place_t[rows] + own.wheels_later_s for rows in (windows.begin, windows.end))
+    of_start, of_end = (steps.place_t[rows] + constants.wheels_later_s for rows in (windows.begin, windows.end))
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
     path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), fitted.parameters, at)
     s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)

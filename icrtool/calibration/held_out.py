@@ -194,11 +194,11 @@ class HeldOut:
         return path_between(recording, found, self.fits[RECOMMENDED].pool.windows[i].track, start, end)
 
 
-def path_between(recording: Recording, found: Prediction, steps: Track, start: int, end: int) -> OpenLoopPath:
+def path_between(recording: Recording, prediction: Prediction, steps: Track, start: int, end: int) -> OpenLoopPath:
     """Return the path that a model predicts between two states of a recording; `steps`: its wheel samples, joined."""
     track, rows = recording.track, np.arange(start, end + 1)
     near = steps.around(track.t[start], track.t[end])
-    turned, place = predicted_path(recording, *found, near)(track.t[rows])
+    turned, place = predicted_path(recording, *prediction, near)(track.t[rows])
     turn = track.heading[start] - turned[0]
     moved = np.exp(1j * turn) * (place - place[0])
     return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, turned + turn)

@@ -63,9 +63,9 @@ def measured_in(recording: Recording, windows: Windows, fitted: FittedModel) -> 
     return KnownConstants(recording.corrected.plus(found.mean), found.std)
 
 
-def constants_document(known: KnownConstants) -> documents.SensorConstants:
+def constants_document(constants: KnownConstants) -> documents.SensorConstants:
     """Return constants as a document, in the units and signs of the configuration."""
-    values, stds = np.array(known.mean) * _TO_DOCUMENT, np.array(known.std) * np.abs(_TO_DOCUMENT)
+    values, stds = np.array(constants.mean) * _TO_DOCUMENT, np.array(constants.std) * np.abs(_TO_DOCUMENT)
     pairs = zip(documents.SensorConstants.__struct_fields__, values.tolist(), stds.tolist(), strict=True)
     return documents.SensorConstants(
         **{name: documents.MeasuredConstant(value, std) for name, value, std in pairs if math.isfinite(value + std)}
@@ -133,7 +133,7 @@ def _further(found: Floats, usual_std: float) -> tuple[float, float]:
     return float(weights @ values) / total, math.sqrt(1.0 / total + between)
 
 
-def left_of(total: KnownConstants, corrected: LogConstants) -> KnownConstants:
+def remaining_constants(total: KnownConstants, corrected: LogConstants) -> KnownConstants:
     """Return what is left of constants after corrections that were made before; NaN where they are not known."""
     return total._replace(mean=total.mean.minus(corrected))
 

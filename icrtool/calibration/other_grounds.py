@@ -85,9 +85,11 @@ def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit])
         yield f"adaptive{GYRO_SUFFIX}", drive.errors(trials, turned=True).position
 
 
-def _held(recording: Recording, trials: Trials, fitted: FittedModel, own: LogConstants) -> Floats:
+def _held(recording: Recording, trials: Trials, fitted: FittedModel, constants: LogConstants) -> Floats:
     """Return the errors (k, h) [m] of a model that is held as it is."""
-    return errors_without(recording, trials, [Fold("", 0, 0, -np.inf, np.inf)], 0, lambda _: (fitted, own)).position
+    return errors_without(
+        recording, trials, [Fold("", 0, 0, -np.inf, np.inf)], 0, lambda _: (fitted, constants)
+    ).position
 
 
 def other_ground_ends(

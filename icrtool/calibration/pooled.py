@@ -185,10 +185,10 @@ def calibrate_recordings(
     """
     widths = {one.width_m for one in recordings}
     if len(widths) > 1:
-        found = ", ".join(f"{width:g} m" for width in sorted(widths))
-        raise ConfigError("robot.track_width_m", f"{found} in the logs given", "calibrate one robot at a time")
-    known = [one for one in recordings if one.sha256]
-    if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
+        widths_text = ", ".join(f"{width:g} m" for width in sorted(widths))
+        raise ConfigError("robot.track_width_m", f"{widths_text} in the logs given", "calibrate one robot at a time")
+    with_sum = [one for one in recordings if one.sha256]
+    if twice := {one.name for one in with_sum if sum(one.sha256 == other.sha256 for other in with_sum) > 1}:
         raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
     table = held_out.hold_out(recordings)
     turnless = ", ".join(one.name for one in recordings if one.track.gyro is None)
@@ -247,17 +247,17 @@ def calibration_from(
     robot = robot if robot is not None else documents.CalibratedRobot(track_width_m=recordings[0].width_m)
     geometry, covariance = table.fits[FIVE].fitted.geometry(robot.track_width_m)
     shared_std = multiplier_between_std(table, robot.track_width_m, geometry.multiplier)
-    found = fitted_document(best.fitted, geometry, covariance, robot, shared_std=shared_std)
+    document = fitted_document(best.fitted, geometry, covariance, robot, shared_std=shared_std)
     errors = held_out.measure_controller_errors(table, has_gyro=has_gyro)
     return Calibration(
         schema=documents.CALIBRATION_SCHEMA,
         tool_version=__version__,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         robot=robot,
-        recommended=found.model,
-        **{name: getattr(found, name) for name in RecommendedDocument.__struct_fields__[1:-1]},
+        recommended=document.model,
+        **{name: getattr(document, name) for name in RecommendedDocument.__struct_fields__[1:-1]},
         controller=documents.ControllerDocument(
-            **asdict(found.controller), **({} if errors is None else asdict(errors))
+            **asdict(document.controller), **({} if errors is None else asdict(errors))
         ),
         gyro=gyro,
         models={name: documents.FittedDocument(*parameter_documents(table.fits[name].fitted)) for name in MODELS},
@@ -281,20 +281,20 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
     if len(table.recordings) < FEWEST_POOLED:
         return None
     pool = table.fits[FIVE].pool
-    found = [Pool([windows], [width_m]).fit(MODELS[FIVE]).fitted.geometry(width_m) for windows in pool.windows]
+    geometries = [Pool([windows], [width_m]).fit(MODELS[FIVE]).fitted.geometry(width_m) for windows in pool.windows]
     place = TrackGeometry._fields.index("multiplier")
-    values = np.array([geometry.multiplier for geometry, _ in found])
-    measured = between_variance(values, np.array([covariance[place, place] for _, covariance in found]))
-    known = (MULTIPLIER_BETWEEN_SHARE * multiplier) ** 2
-    return math.sqrt(pooled_variance(measured, len(values) - 1.0, known)[0])
+    values = np.array([geometry.multiplier for geometry, _ in geometries])
+    measured = between_variance(values, np.array([covariance[place, place] for _, covariance in geometries]))
+    variance_of_others = (MULTIPLIER_BETWEEN_SHARE * multiplier) ** 2
+    return math.sqrt(pooled_variance(measured, len(values) - 1.0, variance_of_others)[0])
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
     """Return a function for the errors of a calibration in trials of a recording, with the recording's constants."""
     fitted = model_for(calibration, recording, with_gyro=with_gyro)
-    found = fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
+    fit = fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]
-    return lambda trials: held_out.errors_without(recording, trials, folds, 0, lambda _: found)
+    return lambda trials: held_out.errors_without(recording, trials, folds, 0, lambda _: fit)
 
 
 def model_for(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> FittedModel:
@@ -408,33 +408,33 @@ class _Taken(NamedTuple):
     ground: str
 
 
-def _is_part(one: _Taken, of: _Taken) -> bool:
+def _is_part(log: _Taken, longer_log: _Taken) -> bool:
     """Return whether a log is only a part of a longer log, for example because its recording was cut off.
 
     The part has the stamps of the longer log. At equal stamps both have equal wheel speeds and positions. Wheel speeds
     that were computed from wheel positions may differ at the ends of the part.
     """
-    part, whole = one.recording, of.recording
-    stamps, theirs = (np.rint(1e9 * log.track.t).astype(np.int64) + log.begin_ns for log in (part, whole))
+    part, whole = log.recording, longer_log.recording
+    stamps, theirs = (np.rint(1e9 * one.track.t).astype(np.int64) + one.begin_ns for one in (part, whole))
     if not (len(stamps) < len(theirs) and theirs[0] <= stamps[-1] and stamps[0] <= theirs[-1]):
         return False
     _, ours, others = np.intersect1d(stamps, theirs, assume_unique=True, return_indices=True)
     shorter, longer = part.wheels(ours), whole.wheels(others)
     same = np.isclose(shorter.v_left, longer.v_left, rtol=SAME_SPEED)
     same &= np.isclose(shorter.v_right, longer.v_right, rtol=SAME_SPEED)
-    shared = np.count_nonzero(np.isin(one.positions, of.positions))
-    return bool(same.sum() >= SAME_SHARE * len(stamps) and shared >= SAME_SHARE * len(one.positions))
+    shared = np.count_nonzero(np.isin(log.positions, longer_log.positions))
+    return bool(same.sum() >= SAME_SHARE * len(stamps) and shared >= SAME_SHARE * len(log.positions))
 
 
-def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unusable: bool) -> str:
+def _why_left_out(run: Run, candidate: _Taken, taken: Sequence[_Taken], *, allow_unusable: bool) -> str:
     """Return why a run is not calibrated with those before it; empty where it is."""
     if not (run.usable or allow_unusable):
         return f"not usable: {run.document.unusable_because}"
-    recording = one.recording
-    for other in before:
+    recording = candidate.recording
+    for other in taken:
         if recording.sha256 and other.recording.sha256 == recording.sha256:
             return f"a copy of {other.recording.name}"
-        if _is_part(one, other):
+        if _is_part(candidate, other):
             return f"a part of {other.recording.name}"
     try:
         cut_windows(recording)

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from icrtool.alignment.wheel_units import with_wheel_speeds
-from icrtool.calibration.held_sensors import left_of, pooled_constants
+from icrtool.calibration.held_sensors import pooled_constants, remaining_constants
 from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.adaptive import TermsPrior
@@ -208,7 +208,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         if corrected is None:
             return prior
         wheels, turned = (
-            left_of(pooled_constants(self.logs, heading_source, with_gyro=with_gyro), corrected).usual()
+            remaining_constants(pooled_constants(self.logs, heading_source, with_gyro=with_gyro), corrected).usual()
             for with_gyro in (False, True)
         )
         return replace(prior, constants=wheels, turned_constants=turned)
@@ -305,12 +305,12 @@ def controller_numbers(
     )  # fmt: skip
 
 
-def parameter_documents(one: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
+def parameter_documents(fitted: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
     """Return terms, parameters and covariance of a model."""
-    rows = zip(one.model.terms, one.parameters.tolist(), one.std.tolist(), strict=True)
-    unseen = one.not_shown
+    rows = zip(fitted.model.terms, fitted.parameters.tolist(), fitted.std.tolist(), strict=True)
+    unseen = fitted.not_shown
     found = {name: ParameterDocument(at, std, "not shown" if name in unseen else "shown") for name, at, std in rows}
-    return one.model.terms, found, one.covariance.tolist()
+    return fitted.model.terms, found, fitted.covariance.tolist()
 
 
 LARGEST_PARAMETER = 1e6

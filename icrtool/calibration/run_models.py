@@ -63,9 +63,9 @@ def with_motion(run: Run) -> RunDocument:
         short = "the drive is too short for a motion model: the filter's ICRs alone are known"
         return msgspec.structs.replace(run.document, partly_because=short if run.usable else None)
     robot = pooled.robot_of(run, width)
-    found = None
+    recommended = None
     if run.usable and run.track_width_m is not None and RECOMMENDED in fits:
-        found = fitted_document(fits[RECOMMENDED], geometry, covariance, robot)
+        recommended = fitted_document(fits[RECOMMENDED], geometry, covariance, robot)
     # An ICR is shown by the excitation of the drive, and by its own standard deviation.
     verdicts = run.document.excitation.verdict
     largest = WEAK_SHARE * abs(geometry.y_icr_right_m - geometry.y_icr_left_m)
@@ -75,10 +75,10 @@ def with_motion(run: Run) -> RunDocument:
             shown |= {name: float(value), f"{name}_std": std}
     document = msgspec.structs.replace(
         run.document,
-        recommended=found,
+        recommended=recommended,
         geometry=GeometryDocument(**shown, covariance_m2=covariance[:ICR_VALUES, :ICR_VALUES].tolist()),
     )
-    if found is None:
+    if recommended is None:
         return _with_verdict(document)
     # The common error of both y ICRs cancels in the multiplier, so its own standard deviation decides.
     numbers = controller_numbers(geometry, covariance, robot)
@@ -221,17 +221,17 @@ def compare_models(
         lever = "in row controller it is a constant of this log"
         why = f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it"
         notes.append(note("lever_unknown", why))
-    found = hold_out([recording])
+    held_out = hold_out([recording])
     driven = recording if past is None else with_poses_of(recording, past)
     rows = [
-        row for row in _rows(run, found, heading, driven) if run.track_width_m is not None or NO_SLIP not in row.name
+        row for row in _rows(run, held_out, heading, driven) if run.track_width_m is not None or NO_SLIP not in row.name
     ]
     rows += adaptive_rows(recording, heading, calibrations, driven, refit_sensors=refit_sensors)
     calibration = None
     if run.track_width_m is not None:
         robot, used = pooled.robot_of(run, recording.width_m), pooled.use_notes(run)
-        calibration = pooled.calibration_from(found, robot, used, has_gyro=heading == "gyro")
-    return ComparedModels(tuple(rows), found, recording.track, heading, tuple(notes), calibration)
+        calibration = pooled.calibration_from(held_out, robot, used, has_gyro=heading == "gyro")
+    return ComparedModels(tuple(rows), held_out, recording.track, heading, tuple(notes), calibration)
 
 
 def with_poses_of(recording: Recording, run: Run) -> Recording:
@@ -246,12 +246,12 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
     notes = list[Note]()
     plain = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     for one in headings:
-        found = pooled.with_turn_rate(plain, one, run.config.frames.gyro_delay_s)
-        if found.track.gyro is not None:
-            if found.gyro_reversed:
+        with_rate = pooled.with_turn_rate(plain, one, run.config.frames.gyro_delay_s)
+        if with_rate.track.gyro is not None:
+            if with_rate.gyro_reversed:
                 why = f"the {one.kind} counts turns in the other direction: its sign was changed"
                 notes.append(note("gyro_sign_changed", why))
-            return found, one.kind, notes
+            return with_rate, one.kind, notes
         why = f"the {one.kind} does not turn with the robot: rows with it are left out"
         notes.append(note("gyro_not_used", why))
     if not notes:

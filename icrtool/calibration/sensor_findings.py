@@ -135,9 +135,9 @@ def _drive(run: Run) -> documents.SensorDrive:
     )
 
 
-def _numbers(one: Finding | documents.SensorParameter) -> tuple[float, float]:
+def _numbers(finding: Finding | documents.SensorParameter) -> tuple[float, float]:
     """Return an estimate and its standard deviation, NaN where the drive does not show it."""
-    return math.nan if one.value is None else one.value, math.nan if one.std is None else one.std
+    return math.nan if finding.value is None else finding.value, math.nan if finding.std is None else finding.std
 
 
 def _parameter(value: float, std: float, verdict: documents.SensorVerdict, note: str = "") -> documents.SensorParameter:

@@ -83,19 +83,19 @@ def compare_calibrations(
     tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
     cells, costs = [], []
     for (row, result), (column, own) in product(results.items(), results.items()):
-        held_out = found = tested[column, column]
+        held_out = applied = tested[column, column]
         if row != column:
             # Another track width or wheel radius: another robot.
             ours, theirs = result.calibration, own.calibration
             same_width = math.isclose(ours.width_m, theirs.width_m, rel_tol=1e-3)
-            found = held_out._replace(errors=np.full_like(held_out.errors, np.nan))
+            applied = held_out._replace(errors=np.full_like(held_out.errors, np.nan))
             if same_width and ours.robot.wheel_radius_m == theirs.robot.wheel_radius_m:
-                found = _test(result, recordings[column], own=False)
-            differences = _differences(held_out, found, paired=True)
+                applied = _test(result, recordings[column], own=False)
+            differences = _differences(held_out, applied, paired=True)
             costs += [documents.TransferCost(*astuple(one), calibrated_on=row, tested_on=column) for one in differences]
         for h, horizon in enumerate(TRANSFER_HORIZONS_M):
-            errors, _ = _sum_up(found.errors[:, h], found.path, horizon)
-            trials = int(np.count_nonzero(np.isfinite(found.errors[:, h])))
+            errors, _ = _sum_up(applied.errors[:, h], applied.path, horizon)
+            trials = int(np.count_nonzero(np.isfinite(applied.errors[:, h])))
             cells.append(documents.TransferCell(*astuple(errors), calibrated_on=row, tested_on=column, trials=trials))
     first, *others = results
     pairs = []
@@ -149,8 +149,8 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
     errors, path, before = [], [], 0.0
     for i, one in enumerate(recordings):
         trials = cut_trials(one, TRANSFER_HORIZONS_M)
-        found = result.table.errors(RECOMMENDED, i, trials) if own else predictor(result.calibration, one)(trials)
-        errors.append(found.position)
+        intervals = result.table.errors(RECOMMENDED, i, trials) if own else predictor(result.calibration, one)(trials)
+        errors.append(intervals.position)
         path.append(before + one.track.distance[trials.starts])
         before = path[-1][-1]
     return _Tested(np.concatenate(errors), np.concatenate(path))
@@ -203,11 +203,11 @@ def same_route(first: Track, second: Track) -> bool:
 
 
 def _parameter_differences(first: Calibration, second: Calibration) -> tuple[documents.ParameterDifference, ...]:
-    found = []
+    differences = []
     for name in COMPARED:
         before, after = first.geometry[name], second.geometry[name]
         difference, std = after - before, math.hypot(first.geometry_std[name], second.geometry_std[name])
-        found.append(
+        differences.append(
             documents.ParameterDifference(name, before, after, difference, std, abs(difference) > TWO_SIDED * std)
         )
-    return tuple(found)
+    return tuple(differences)

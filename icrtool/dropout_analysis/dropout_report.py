@@ -214,31 +214,36 @@ def report_on(
     rows = _TestedRows((), (), (), (), None, unusable)
     if not unusable:
         rows = _tested_rows(runs, calibrations, scored, request, watch)
-    found, horizons_m = rows.found, _horizons_of(run, request, limits)
+    compared_models, horizons_m = rows.compared_models, _horizons_of(run, request, limits)
     errors = measure_errors(
         compared, horizons_m, further=rows.all, starts=request.starts, seed=request.seed, sink=sink,
-        starts_of_further=None if found is None else found.table.trials[0].starts,
-        track=None if found is None else found.track, watch=watch,
+        starts_of_further=None if compared_models is None else compared_models.table.trials[0].starts,
+        track=None if compared_models is None else compared_models.track, watch=watch,
     )  # fmt: skip
     watch("budgets and limits")
-    if found is not None and (against := why_unusable(run.document, errors, [row.name for row in found.rows])):
+    if compared_models is not None and (
+        against := why_unusable(run.document, errors, [row.name for row in compared_models.rows])
+    ):
         compared, errors = _contradicted(compared, errors, against)
-        found, unusable = found._replace(calibration=None), "" if request.allow_unusable else against.text
+        compared_models, unusable = (
+            compared_models._replace(calibration=None),
+            "" if request.allow_unusable else against.text,
+        )
     cost = None
     if request.without_events:
         crossed = replace(compared, in_gap=runs.with_events.in_gap)
         cost = measure_errors(crossed, horizons_m, starts=request.starts, seed=request.seed)
-    by_start = shown_paths.errors_by_start(compared, found, starts=request.starts)
+    by_start = shown_paths.errors_by_start(compared, compared_models, starts=request.starts)
     budgets_m = () if unusable else request.budgets_m
     budgets = [one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)]
     return _report(
         compared, errors, request,
         with_events=cost,
-        found=found,
+        compared_models=compared_models,
         left_out=rows.left_out,
         calibrations=rows.calibrations,
         examples=examples,
-        worst=shown_paths.worst_trials(compared, found, further=rows.of_topics, errors=by_start),
+        worst=shown_paths.worst_trials(compared, compared_models, further=rows.of_topics, errors=by_start),
         path_errors=by_start.on_path,
         outages=(*forced, *shown_paths.real_outages(compared)),
         budgets=with_other_grounds(budgets, rows.calibrations),
@@ -310,7 +315,7 @@ class _TestedRows(NamedTuple):
     of_calibrations, of_topics : their rows
     calibrations : the record of each used calibration
     notes : about the sensors of calibrations, and about topics
-    found : the rows of this log's own models; None where they were left out
+    compared_models : the rows of this log's own models; None where they were left out
     left_out : why they were left out
     """
 
@@ -318,13 +323,17 @@ class _TestedRows(NamedTuple):
     of_topics: Sequence[ComparedRow]
     calibrations: tuple[UsedCalibration, ...]
     notes: tuple[Note, ...]
-    found: ComparedModels | None
+    compared_models: ComparedModels | None
     left_out: str
 
     @property
     def all(self) -> list[ComparedRow]:
         """All rows, in the order of the report."""
-        return [*(() if self.found is None else self.found.rows), *self.of_calibrations, *self.of_topics]
+        return [
+            *(() if self.compared_models is None else self.compared_models.rows),
+            *self.of_calibrations,
+            *self.of_topics,
+        ]
 
 
 def _tested_rows(
@@ -335,16 +344,16 @@ def _tested_rows(
     watch("calibrations")
     used, of_calibrations, notes = _calibration_rows(compared, filtered, calibrations, request)
     of_topics, topic_notes = topic_rows(compared, track_of(compared), scored) if scored else ([], [])
-    found, left_out = None, ""
+    compared_models, left_out = None, ""
     if request.ladder:
         watch("comparing models")
         try:
-            found = compare_models(
+            compared_models = compare_models(
                 compared, measured_headings(filtered), calibrations, filtered, refit_sensors=request.refit_sensors
             )
         except DataError as err:
             left_out = f"{err.why}, {err.advice}"
-    return _TestedRows(of_calibrations, of_topics, used, (*notes, *topic_notes), found, left_out)
+    return _TestedRows(of_calibrations, of_topics, used, (*notes, *topic_notes), compared_models, left_out)
 
 
 def _contradicted(run: Run, errors: report.OpenLoopErrors, why: Note) -> tuple[Run, report.OpenLoopErrors]:
@@ -377,7 +386,7 @@ def _report(
     run: Run, errors: report.OpenLoopErrors, request: ReportRequest, *,
     with_events: report.OpenLoopErrors | None = None, calibrations: tuple[UsedCalibration, ...] = (),
     budgets: tuple[BudgetDistance, ...] = (), gates: tuple[Verdict, ...] = (),
-    by_turning: tuple[TurningSplit, ...] = (), found: ComparedModels | None = None, left_out: str = "",
+    by_turning: tuple[TurningSplit, ...] = (), compared_models: ComparedModels | None = None, left_out: str = "",
     worst: tuple[documents.ExampleTrial, ...] = (), examples: tuple[documents.ExampleTrial, ...] = (),
     outages: tuple[documents.Outage, ...] = (), baseline: report.BaselineReport | None = None, usable: bool = True,
     notes: tuple[Note, ...] = (), path_errors: documents.PathErrors | None = None,
@@ -390,15 +399,15 @@ def _report(
     with_events : errors of all trials; given where `errors` leaves out the trials that cross a slip event
     notes : notes about the rows, in addition to the run's notes
     """
-    made = None if found is None else found.calibration
-    notes = (*run.notes, *(() if found is None else found.notes), *notes)
-    cost = None
+    calibration = None if compared_models is None else compared_models.calibration
+    notes = (*run.notes, *(() if compared_models is None else compared_models.notes), *notes)
+    event_cost = None
     if with_events is not None:
         all_rows = {one.name: one.document.by_horizon for one in with_events.results}
         numbers = {
             name: [documents.ErrorRow(*astuple(row)[:ERROR_FIELDS]) for row in rows] for name, rows in all_rows.items()
         }
-        cost = documents.EventCostDocument(len(run.sensors.events), numbers)
+        event_cost = documents.EventCostDocument(len(run.sensors.events), numbers)
     earlier = None
     if baseline is not None:
         same, changes = baseline.is_of(run.document), baseline.changes(run.document)
@@ -414,7 +423,7 @@ def _report(
         request=request,
         starts=errors.states,
         starts_standing=errors.standing,
-        without_events=cost,
+        without_events=event_cost,
         tolerance_m=TOLERANCE_M,
         intervals=documents.IntervalsDocument(
             method="Student's t over blocks of path",
@@ -429,11 +438,11 @@ def _report(
         by_learning=errors.by_learning,
         calibrations=calibrations,
         # Without the date: the same run gives the same file.
-        recommended=None if made is None else msgspec.structs.replace(made, created=UNSET),
+        recommended=None if calibration is None else msgspec.structs.replace(calibration, created=UNSET),
         budgets=budgets,
         best=report.best_row(errors, calibrations) if usable else None,
         by_turning=by_turning,
-        ladder=_ladder(errors, calibrations, found, left_out),
+        ladder=_ladder(errors, calibrations, compared_models, left_out),
         gates=gates,
         passed=all(one.passed for one in gates),
         baseline=earlier,
@@ -444,8 +453,8 @@ def _report(
     return report.DropoutReport(
         **{field.name: getattr(errors, field.name) for field in fields(errors)}, document=document,
         run_directory=run.directory, reference_north_m=run.table.north_m, reference_east_m=run.table.east_m,
-        usable=usable, worst=worst, examples=examples, outages=outages, path_errors=path_errors, calibration=made,
-        baseline=baseline,
+        usable=usable, worst=worst, examples=examples, outages=outages, path_errors=path_errors,
+        calibration=calibration, baseline=baseline,
     )  # fmt: skip
 
 
@@ -474,22 +483,25 @@ def _counts(
 
 
 def _ladder(
-    errors: report.OpenLoopErrors, calibrations: Sequence[UsedCalibration], found: ComparedModels | None, why_none: str
+    errors: report.OpenLoopErrors,
+    calibrations: Sequence[UsedCalibration],
+    compared_models: ComparedModels | None,
+    why_none: str,
 ) -> documents.LadderDocument:
     """Return how the models were compared, or why the comparison was left out."""
-    if found is None:
+    if compared_models is None:
         return documents.LadderDocument(left_out=why_none)
-    given, turned = {one.name for one in calibrations}, f"_{found.heading}"
+    of_calibrations, turned = {one.name for one in calibrations}, f"_{compared_models.heading}"
     models = []
     for one in errors.results:
-        if one.name not in given and kind_of(one.name) != TOPIC_ROW:
-            with_heading = bool(found.heading) and one.name.endswith(turned)
+        if one.name not in of_calibrations and kind_of(one.name) != TOPIC_ROW:
+            with_heading = bool(compared_models.heading) and one.name.endswith(turned)
             rows = [astuple(row)[1:ERROR_FIELDS] for row in one.document.by_horizon]
-            heading = found.heading if with_heading else "wheels"
+            heading = compared_models.heading if with_heading else "wheels"
             models.append(
                 documents.ScoreDocument(one.name, one.document.knows, heading, *map(list, zip(*rows, strict=True)))
             )
-    table, fits = found.table, {}
+    table, fits = compared_models.table, {}
     for name, fit in table.fits.items():
         value, std = (dict(zip(fit.model.terms, column.tolist(), strict=True)) for column in (fit.parameters, fit.std))
         fits[name] = documents.FitDocument(plain(value), plain(std))
@@ -497,8 +509,8 @@ def _ladder(
         horizons_m=errors.horizons_m.tolist(),
         blocks=len(table.folds),
         starts=int(np.count_nonzero((table.trials[0].ends >= 0).any(axis=1))),
-        heading=found.heading or None,
-        notes=list(found.notes),
+        heading=compared_models.heading or None,
+        notes=list(compared_models.notes),
         models=models,
         width_m=table.recordings[0].width_m,
         fits=fits,
@@ -521,17 +533,17 @@ def with_other_grounds(
     }
     # row ``adaptive`` begins with the first calibration that was not fitted to this log
     first = next(iter(scores.values()), ())
-    found = []
+    distances = []
     for one in budgets:
         by, kind = turned_by(one.model), kind_of(one.model)
         row = f"{RECOMMENDED if kind == 'calibration' else kind}{f'_{by}' if by else ''}"
         of_row = {"calibration": scores.get(one.model, ()), "adaptive": first}.get(kind, ())
         ends = other_ground_ends(of_row, row, one.budget_m)
         if ends is None:
-            found.append(one)
+            distances.append(one)
         else:
-            found.append(msgspec.structs.replace(one, other_low_m=ends[0], other_high_m=ends[1]))
-    return tuple(found)
+            distances.append(msgspec.structs.replace(one, other_low_m=ends[0], other_high_m=ends[1]))
+    return tuple(distances)
 
 
 def _calibration_rows(
@@ -555,9 +567,9 @@ def _calibration_rows(
             name = f"calibration:{stem}"
         created = one.created or ""
         of_sensors = dict.fromkeys(CalibrationFile.__struct_fields__[1:], UNSET)
-        kept = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
-        seen = one.fitted_to(recording.sha256)
-        fitted = "fitted to this log" if seen else "not fitted to this log"
+        short_record = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
+        fitted_to_this = one.fitted_to(recording.sha256)
+        fitted = "fitted to this log" if fitted_to_this else "not fitted to this log"
         refitted = "; sensors refitted" if request.refit_sensors else ""
         rows = [(name, one.recommended, False)]
         if one.gyro is not None and recording.track.gyro is not None:
@@ -569,5 +581,7 @@ def _calibration_rows(
             models.append(ComparedRow(row, tested.drive.errors, knows=f"other logs ({fitted}); {tested.knows}"))
             notes += tested.notes
             words = f"{fitted}{refitted}", tested.sensors
-            used.append(UsedCalibration(row, model, len(one.logs), seen, created, with_gyro, kept, *words))
+            used.append(
+                UsedCalibration(row, model, len(one.logs), fitted_to_this, created, with_gyro, short_record, *words)
+            )
     return tuple(used), models, notes

@@ -104,17 +104,18 @@ def worst_trials(
     further : further rows whose paths are shown
     errors : what `errors_by_start` returns, where it is known
     """
-    found = errors_by_start(run, compared, horizon_m, starts=starts) if errors is None else errors
-    track, models, ends = track_of(run), models_of(run), found.end
-    left = np.nan_to_num(found.error_m, nan=-1.0)
+    of_starts = errors_by_start(run, compared, horizon_m, starts=starts) if errors is None else errors
+    track, models, ends = track_of(run), models_of(run), of_starts.end
+    untaken = np.nan_to_num(of_starts.error_m, nan=-1.0)
     chosen: list[int] = []
-    while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
+    while len(chosen) < count and untaken[worst := int(np.argmax(untaken))] >= 0.0:
         chosen.append(worst)
         before_its_end = slice(ends[worst] + 1)
-        left[before_its_end][ends[before_its_end] >= worst] = -1.0
+        untaken[before_its_end][ends[before_its_end] >= worst] = -1.0
     rows = (*(compared.rows if compared is not None else ()), *further)
     return tuple(
-        _example(run, track, models, rows, found.name, start, int(ends[start]), found.horizon_m) for start in chosen
+        _example(run, track, models, rows, of_starts.name, start, int(ends[start]), of_starts.horizon_m)
+        for start in chosen
     )
 
 

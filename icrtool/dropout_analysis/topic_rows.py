@@ -147,8 +147,8 @@ def _wheels_depart(run: Run, track: Track, covered: np.ndarray) -> bool:
     """Return whether the error of the wheels' path grows over the drive, so that the reference shows such errors."""
     path = drive_wheels(run.table, run.in_gap, odometry_icrs(run.table, None)["icr"])
     rows = _compared_rows(track, covered)
-    found = _departure(path.north_m[rows] + 1j * path.east_m[rows], track.place[rows], track.distance[rows])
-    return found is not None and found.grows is True
+    departure = _departure(path.north_m[rows] + 1j * path.east_m[rows], track.place[rows], track.distance[rows])
+    return departure is not None and departure.grows is True
 
 
 def _compared_rows(track: Track, covered: np.ndarray) -> Ints:

@@ -99,8 +99,8 @@ def measure_errors(
         raise ValueError("two models have the same name")
     standing, learned = standing_states(track), first_learned(run)
     sparse = starts_of_further if starts_of_further is not None else _sparse_starts(standing)
-    few = _errors_of_few(track, predictors, Trials(sparse, counted_ends(track, horizons, starts, sparse)))
-    found: list[list[_AtHorizon]] = [[] for _ in predictors]
+    sparse_errors = _errors_of_few(track, predictors, Trials(sparse, counted_ends(track, horizons, starts, sparse)))
+    by_model: list[list[_AtHorizon]] = [[] for _ in predictors]
     counts: list[TrialCounts] = []
     drawn: list[list[DrawnTrials]] = []
     before, after = list[documents.ErrorRow](), list[documents.ErrorRow]()
@@ -111,7 +111,9 @@ def measure_errors(
         for columns in [slice(begin, begin + at_once) for begin in range(0, len(horizons), at_once)]:
             group, ends = horizons[columns], counted_ends(track, horizons[columns], starts).T
             trials = _Started.of(run, track, group, ends)
-            for number, (model, of_few, rows) in enumerate(zip(predictors, few, found, strict=True), start=1):
+            for number, (model, of_few, rows) in enumerate(
+                zip(predictors, sparse_errors, by_model, strict=True), start=1
+            ):
                 watch(f"errors, row {number} of {len(predictors)}")
                 if isinstance(model, ComparedRow):
                     errors = of_few.position[:, columns]
@@ -133,7 +135,7 @@ def measure_errors(
     return OpenLoopErrors(
         run_document=run.document,
         horizons_m=horizons,
-        results=tuple(map(_result, predictors, found)),
+        results=tuple(map(_result, predictors, by_model)),
         counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
         states=len(run.table),
         standing=int(np.count_nonzero(standing)),
@@ -351,9 +353,9 @@ def _aligned(errors: Floats, blocks: statistics.Blocks | None) -> documents.Alig
     return documents.AlignedErrors(expected, p95, statistics.block_sums(errors, blocks, ranked, p50, p95))
 
 
-def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> documents.ModelResult:
+def _result(model: Model | ComparedRow, by_horizon: Iterable[_AtHorizon]) -> documents.ModelResult:
     """Return the result of one model from its statistics at each horizon."""
-    rows, bins, sums, free, aligned = zip(*found, strict=True)
+    rows, bins, sums, free, aligned = zip(*by_horizon, strict=True)
     blocks = []
     for row, one in zip(rows, sums, strict=True):
         if one is not None:

@@ -100,8 +100,8 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
     parameters, by_icrs = parameters_of_icrs(np.array([right, left, x]), WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
 
-    def twists(some: slice) -> tuple[Floats, Ints, Floats]:
-        return model_columns(FULL_LINEAR, wheel_motion(track.v_left[some], track.v_right[some], WIDTH_M))
+    def twists(rows: slice) -> tuple[Floats, Ints, Floats]:
+        return model_columns(FULL_LINEAR, wheel_motion(track.v_left[rows], track.v_right[rows], WIDTH_M))
 
     path = path_at(track, twists, parameters, track.t[rows])
     windows = Windows(track, rows[:-1], rows[1:], np.diff(distance))
@@ -172,19 +172,19 @@ def final_covariance(
 
     Halves of recorded drives are the least certain, most of all in x_icr, because they have different turns and speeds.
     """
-    width_m, kept = windows.separation_m, windows.track.t[windows.begin] >= since_s
-    if np.count_nonzero(kept) < 2:
+    width_m, is_late = windows.separation_m, windows.track.t[windows.begin] >= since_s
+    if np.count_nonzero(is_late) < 2:
         return filter_covariance + np.eye(3) * width_m**2
     forgets = process_icr_mps**2 * REFERENCE_STEP_S
     memory_m = float(np.trace(filter_covariance)) / 3.0 / forgets if forgets > 0.0 else math.inf
-    weight = np.tile(np.exp((windows.end_m - windows.end_m[-1]) / memory_m)[kept], 3)
-    kind, rows = np.repeat(np.arange(3), np.count_nonzero(kept)), np.tile(kept, 3)
+    weight = np.tile(np.exp((windows.end_m - windows.end_m[-1]) / memory_m)[is_late], 3)
+    kind, rows = np.repeat(np.arange(3), np.count_nonzero(is_late)), np.tile(is_late, 3)
     residuals, prior = windows.residuals[rows], np.diag(prior_std(width_m) ** -2.0)
     scale = np.hypot(scale_by_kind(residuals, kind), windows.noise[kind]) / np.sqrt(weight)
     at_final_icrs = Linearised(residuals=residuals, jacobian=windows.jacobian[rows], scale=scale, prior=prior)
     slip = 1.0 if track_width_m is None else min(max(abs(width_m / track_width_m - 1.0) / SLIPS, LEAST_SLIP), 1.0)
     of_stretch = slip * width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
-    return sandwich_covariance(at_final_icrs, np.tile(windows.stretch[kept], 3), of_stretch)[:3, :3]
+    return sandwich_covariance(at_final_icrs, np.tile(windows.stretch[is_late], 3), of_stretch)[:3, :3]
 
 
 def multiplier_std(covariance: Floats, track_width_m: float) -> float:
@@ -239,21 +239,21 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
     information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
     std: Floats = np.sqrt(np.diag(np.linalg.solve(information, np.eye(6)))[:3])
     turns, spins = _turns(track, width)
-    right, spun_right = (float(some.clip(min=0.0).sum()) for some in (turns, turns[spins]))
-    left, spun_left = (0.0 - float(some.clip(max=0.0).sum()) for some in (turns, turns[spins]))
+    turned_right, spun_to_right = (float(some.clip(min=0.0).sum()) for some in (turns, turns[spins]))
+    turned_left, spun_to_left = (0.0 - float(some.clip(max=0.0).sum()) for some in (turns, turns[spins]))
     stds: dict[str, float] = dict(zip(ICR_COLUMNS, std.tolist(), strict=True))
     verdicts: dict[str, Excited] = {
         name: "shown" if value / width <= SHOWN_SHARE else "weak" if value / width <= WEAK_SHARE else "not shown"
         for name, value in stds.items()
     }
-    notes = _lacking(stds, verdicts, right, left, windows)
+    notes = _lacking(stds, verdicts, turned_right, turned_left, windows)
     for name, why in unlearned.items():
         if verdicts[name] != "not shown":
             notes.append(note("icr_not_learned", f"{ICR_WORDS[name]} is not shown: {why}"))
         verdicts[name] = "not shown"
     return ExcitationDocument(
-        NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(right),
-        math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), tuple(notes),
+        NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(turned_right),
+        math.degrees(turned_left), math.degrees(spun_to_right), math.degrees(spun_to_left), tuple(notes),
     )  # fmt: skip
 
 
@@ -291,7 +291,7 @@ def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[
 
 
 def _lacking(
-    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, windows: StateWindows
+    stds: dict[str, float], verdicts: dict[str, Excited], turned_right: float, turned_left: float, windows: StateWindows
 ) -> list[Note]:
     """Return findings about ICRs that are not shown: the reason, and what to drive."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
@@ -301,22 +301,23 @@ def _lacking(
     first = note("icrs_poorly_shown", f"this drive could not show the ICRs well: {unshown}")
     turned = np.abs(windows.turned[1:])
     steered = float(turned[turned > SURELY_TURNED_RAD].sum())
-    if steered > TURNS_NEEDED_RAD and right + left < STEERS * steered:
-        angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(right + left):.0f}°"
+    turned_rad = turned_right + turned_left
+    if steered > TURNS_NEEDED_RAD and turned_rad < STEERS * steered:
+        angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(turned_rad):.0f}°"
         why = f"{angles}: it steers as a car does, and has no track ICRs, or one side is a copy of the other"
         return [first, note("steers_as_car", why)]
-    if lacks := lacking_turns(right, left):
+    if lacks := lacking_turns(turned_right, turned_left):
         return [first, note("turns_lacking", lacks)]
     why = f"too few turns in {windows.distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}"
     return [first, note("turns_lacking", why)]
 
 
-def lacking_turns(right_rad: float, left_rad: float) -> str:
+def lacking_turns(right_rad: float, residual_rad: float) -> str:
     """Return which turns a drive lacks and what to drive, from its turns to either side; empty where it has enough."""
-    total = right_rad + left_rad
+    total = right_rad + residual_rad
     if total < TURNS_NEEDED_RAD:
         return f"hardly any turns ({math.degrees(total):.0f}° in all): {SPIN_BOTH}"
-    if min(right_rad, left_rad) < ONE_DIRECTION * max(right_rad, left_rad):
-        side = "left" if right_rad > left_rad else "right"
+    if min(right_rad, residual_rad) < ONE_DIRECTION * max(right_rad, residual_rad):
+        side = "left" if right_rad > residual_rad else "right"
         return f"turned in one direction only: drive two full turns on the spot, or circles, to the {side}"
     return ""

@@ -43,7 +43,7 @@ robot does: its controller then corrects the slip."""
 
 WORTH_WARNING_SHARE = 0.1
 DELAY_SIGMAS = 3.0
-LARGEST_TURN_LEFT, LEFT_SIGMAS = 0.5, 2.0
+LARGEST_TURN_UNEXPLAINED, UNEXPLAINED_SIGMAS = 0.5, 2.0
 """Unexplained share of the turns' variance above which wheels explain almost none of the turns, and the number of
 standard deviations by which it must be above."""
 
@@ -107,9 +107,9 @@ def unusable_reasons(
     elif contradiction and not hidden:
         reasons.append(note("windows_contradict", contradiction))
     if wheel_scale is not None and wheel_scale.value is not None and wheel_scale.std is not None:
-        left = wheel_scale.value / wheel_scale.applied
-        if wheel_scale.std < LARGEST_SCALE_STD and abs(left - 1.0) > LARGEST_SCALE_CORRECTION:
-            far = f"the robot goes {100 * left:.0f} % of the distance that the wheels report"
+        remaining_scale = wheel_scale.value / wheel_scale.applied
+        if wheel_scale.std < LARGEST_SCALE_STD and abs(remaining_scale - 1.0) > LARGEST_SCALE_CORRECTION:
+            far = f"the robot goes {100 * remaining_scale:.0f} % of the distance that the wheels report"
             reasons.append(note("wheel_scale_wrong", far))
     if twist_separation is not None and not hidden:
         reasons += _twist_reasons(*twist_separation)
@@ -119,12 +119,14 @@ def unusable_reasons(
 def _why_turns_unexplained(wheels: WheelFacts | None) -> str:
     """Return that the wheels do not show the turns; empty where they explain most of their variance, or may."""
     slip = "do they slip, as on ice?"
-    if wheels is None or wheels.turn_left is None or wheels.turn_left_std is None:
+    if wheels is None or wheels.turn_unexplained is None or wheels.turn_unexplained_std is None:
         return f"the wheels explain almost none of the turns: {slip}"
-    left, std = wheels.turn_left, wheels.turn_left_std
-    if left - LEFT_SIGMAS * std < LARGEST_TURN_LEFT:
+    unexplained, std = wheels.turn_unexplained, wheels.turn_unexplained_std
+    if unexplained - UNEXPLAINED_SIGMAS * std < LARGEST_TURN_UNEXPLAINED:
         return ""
-    return f"the wheels explain {100 * max(1.0 - left, 0.0):.0f} ± {100 * std:.0f} % of the turns' variance: {slip}"
+    return (
+        f"the wheels explain {100 * max(1.0 - unexplained, 0.0):.0f} ± {100 * std:.0f} % of the turns' variance: {slip}"
+    )
 
 
 def _twist_reasons(separation: float, std: float) -> list[Note]:
@@ -212,24 +214,24 @@ def run_warnings(
     findings : of the alignment
     inverted : the right ICR ended left of the left one
     """
-    found = list[Note]()
+    notes = list[Note]()
     if multiplier is not None and excitation.verdict.shows_sides:
         value, std = multiplier
         if abs(value - 1.0) <= max(ROLLS, 2.0 * std) and std <= ROLLS_STD:
             rolls = f"this robot turns as a differential drive (multiplier {value:.3f} ± {std:.3f})"
-            found.append(note("robot_does_not_slip", f"{rolls}: ICRs improve nothing"))
+            notes.append(note("robot_does_not_slip", f"{rolls}: ICRs improve nothing"))
         elif not MULTIPLIERS[0] <= value <= MULTIPLIERS[1]:
             cause = f"slip makes it 1 to {MULTIPLIERS[1]:g}: check robot.track_width_m, wheel radius and sides"
-            found.append(note("multiplier_unusual", f"the ICRs are {value:.2f} of the track width apart; {cause}"))
+            notes.append(note("multiplier_unusual", f"the ICRs are {value:.2f} of the track width apart; {cause}"))
     if inverted:
         why = "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
-        found.append(note("icrs_ended_inverted", why))
+        notes.append(note("icrs_ended_inverted", why))
     delays = {"fixes": "position_delay_s", "headings": "heading_delay_s"}
     for word, share in rejected.items():
         if share > WORTH_WARNING_SHARE:
             cause = _cause_of_rejection(findings.get(delays[word]))
-            found.append(note(REJECTED[word], f"{100 * share:.0f} % of the {word} were rejected: {cause}"))
-    return about(name, found)
+            notes.append(note(REJECTED[word], f"{100 * share:.0f} % of the {word} were rejected: {cause}"))
+    return about(name, notes)
 
 
 def _cause_of_rejection(delay: Finding | None) -> str:
@@ -237,10 +239,11 @@ def _cause_of_rejection(delay: Finding | None) -> str:
     scatter = "they jump or scatter by more than they state"
     if delay is None or delay.value is None or delay.std is None:
         return f"their clock, or {scatter}; this drive does not show their delay"
-    left = delay.value - delay.applied
-    if abs(left) > DELAY_SIGMAS * delay.std:
-        return f"they {'lag' if left > 0 else 'lead'} the wheels by {abs(left):.2f} ± {delay.std:.2f} s, or {scatter}"
-    return f"{scatter} (their clock agrees with the wheels to {max(delay.std, abs(left)):.2f} s)"
+    remaining_s = delay.value - delay.applied
+    if abs(remaining_s) > DELAY_SIGMAS * delay.std:
+        does = "lag" if remaining_s > 0 else "lead"
+        return f"they {does} the wheels by {abs(remaining_s):.2f} ± {delay.std:.2f} s, or {scatter}"
+    return f"{scatter} (their clock agrees with the wheels to {max(delay.std, abs(remaining_s)):.2f} s)"
 
 
 def antenna_warning(name: str, table: States, covariance: Floats) -> list[Note]:

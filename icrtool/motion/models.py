@@ -318,9 +318,9 @@ class FittedModel:
     @property
     def not_shown(self) -> tuple[str, ...]:
         """Names of the terms that the data did not show: they rest on the prior."""
-        left = self.std / self.model.prior_std > NOT_SHOWN
+        hardly_narrowed = self.std / self.model.prior_std > NOT_SHOWN
         near = np.abs(self.parameters - self.model.prior_mean) < 2.0 * self.std
-        return tuple(name for name, unseen in zip(self.model.terms, left & near, strict=True) if unseen)
+        return tuple(name for name, unseen in zip(self.model.terms, hardly_narrowed & near, strict=True) if unseen)
 
     def complete(self, motion: WheelMotion) -> WheelMotion:
         """Return a motion with the turn rate of the wheels-only model, where the model has one."""

@@ -326,9 +326,9 @@ class PooledFit(FittedModel):
         residuals, jacobian, pull = at.residuals[clear], at.jacobian[clear], std**-2.0
 
         def near(x: Floats) -> Linearised:
-            left = residuals + jacobian @ (x - at.x)
-            scale, prior = scale_by_kind(left, pool.kind[clear]), np.diag(pull)
-            return Linearised(residuals=left, jacobian=jacobian, scale=scale, prior=prior, overlap=pool.overlap)
+            predicted = residuals + jacobian @ (x - at.x)
+            scale, prior = scale_by_kind(predicted, pool.kind[clear]), np.diag(pull)
+            return Linearised(residuals=predicted, jacobian=jacobian, scale=scale, prior=prior, overlap=pool.overlap)
 
         gradient, curvature = self._derivatives(~clear)
         x = at.x + np.linalg.solve(self.curvature - curvature, gradient)

@@ -203,8 +203,8 @@ class WheelFacts(Record, frozen=True, kw_only=True):
     filtered : in words, how the wheels show that a filter made them; None where they do not
     windows, stretches : windows in which wheels and positions were compared, and how many count as independent
     residual_m : robust standard deviation of their displacements; None without windows
-    turn_left, turn_left_std : share of the variance of the robot's turns over a second that the wheels do not explain,
-        1 - R^2, and its standard deviation; None without windows
+    turn_unexplained, turn_unexplained_std : share of the variance of the robot's turns over a second that the wheels do
+        not explain, 1 - R^2, and its standard deviation; None without windows
     ground_change_s : when the ground first changes, since the first wheel sample; None where it does not
     ground_stretches : the stretches between changes of ground; none where it does not change
     """
@@ -219,8 +219,8 @@ class WheelFacts(Record, frozen=True, kw_only=True):
     windows: int
     stretches: int
     residual_m: float | None
-    turn_left: float | None = None
-    turn_left_std: float | None = None
+    turn_unexplained: float | None = None
+    turn_unexplained_std: float | None = None
     ground_change_s: float | None = None
     ground_stretches: tuple[GroundStretch, ...] = ()
 

@@ -70,8 +70,8 @@ def test_a_drive_on_one_ground_shows_no_change() -> None:
     run = fit(make_log(seconds=240.0), CONFIG)
     assert run.document.wheels.ground_change_s is None
     assert run.document.partly_because is None
-    assert run.document.wheels.turn_left is not None
-    assert run.document.wheels.turn_left < 0.05
+    assert run.document.wheels.turn_unexplained is not None
+    assert run.document.wheels.turn_unexplained < 0.05
     assert run.document.wheels.ground_stretches == ()
 
 

@@ -15,8 +15,8 @@ from icrtool.calibration.held_sensors import (
     BETWEEN_DRIVES_STD,
     constants_document,
     known_constants,
-    left_of,
     pooled_constants,
+    remaining_constants,
 )
 from icrtool.calibration.pooled import turning_recording_of
 from icrtool.calibration.record import Calibration
@@ -201,6 +201,6 @@ def test_constants_come_back_from_their_document_and_corrections_add_up() -> Non
     for one, other in zip(known_constants(document), known, strict=True):
         assert one == pytest.approx(other, rel=1e-12)
     corrected = LogConstants(3.1, 0.05, 0.0, -0.1)
-    left = left_of(known, corrected).mean
+    left = remaining_constants(known, corrected).mean
     assert corrected.plus(left) == pytest.approx(known.mean, abs=1e-12)
     assert abs(left.heading_offset_rad) <= np.pi

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.config import load_config
-from icrtool.estimation.run_warnings import LARGEST_TURN_LEFT
+from icrtool.estimation.run_warnings import LARGEST_TURN_UNEXPLAINED
 from icrtool.kernels.kinematics import drive, poses_at
 from icrtool.pipeline import fit
 from icrtool.records.run import Run
@@ -73,11 +73,11 @@ def fast_log(seed: int, *, vary: float, seconds: float = 240.0) -> RobotLog:
 def test_fast_turns_that_the_wheels_explain_are_usable(seed: int) -> None:
     run = fit(fast_log(seed, vary=0.04), CONFIG)
     wheels = run.document.wheels
-    assert wheels.turn_left is not None
-    assert wheels.turn_left_std is not None
+    assert wheels.turn_unexplained is not None
+    assert wheels.turn_unexplained_std is not None
     # R^2 about 0.996, as in the recording
-    assert 0.0005 < wheels.turn_left < 0.03
-    assert wheels.turn_left + 4.0 * wheels.turn_left_std < LARGEST_TURN_LEFT
+    assert 0.0005 < wheels.turn_unexplained < 0.03
+    assert wheels.turn_unexplained + 4.0 * wheels.turn_unexplained_std < LARGEST_TURN_UNEXPLAINED
     assert run.usable, run.summary["unusable_because"]
     value, std = multiplier_of(run)
     assert abs(value - (ICRS[0] - ICRS[1]) / WIDTH_M) < 3.0 * std
@@ -90,8 +90,8 @@ def test_fast_turns_that_the_wheels_explain_are_usable(seed: int) -> None:
 def test_wheels_that_explain_nothing_are_refused_by_the_share_that_they_leave() -> None:
     run = fit(fast_log(3, vary=0.9), CONFIG)
     assert not run.usable
-    assert run.document.wheels.turn_left is not None
-    assert run.document.wheels.turn_left > 0.2
+    assert run.document.wheels.turn_unexplained is not None
+    assert run.document.wheels.turn_unexplained > 0.2
 
 
 def multiplier_of(run: Run) -> tuple[float, float]:
