@@ -204,8 +204,11 @@ class View(LiveLine):
         elapsed = time.monotonic() - self._begun
         if worked:
             rate = worked / elapsed
-            left = (self._logs - done) / rate
-            parts += [f"{60 * rate:.3g} logs/min", f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"]
+            remaining_s = (self._logs - done) / rate
+            parts += [
+                f"{60 * rate:.3g} logs/min",
+                f"{remaining_s / 60:.0f} min left" if remaining_s > 90 else f"{remaining_s:.0f} s left",
+            ]
         width = shutil.get_terminal_size().columns - 1
         stages = list(self._stages.items())
         space = (width - len("  ".join(parts))) // max(len(stages), 1) - LONGEST_STAGE

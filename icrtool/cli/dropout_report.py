@@ -41,10 +41,10 @@ EPILOG_GATE = (
 
 def distances(text: str) -> tuple[float, ...]:
     """Read the distances [m] of ``--horizons``."""
-    found = options.numbers("M,M,...")(text)
-    if min(found) <= 0:
+    metres = options.numbers("M,M,...")(text)
+    if min(metres) <= 0:
         raise click.BadParameter(f"{text!r} has a distance that is not above zero")
-    return found
+    return metres
 
 
 REPORT_OPTIONS = options.reporting(
@@ -90,11 +90,11 @@ def dropout_report_command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
-    known = options.calibrations_of(calibrations, report)
+    held = options.calibrations_of(calibrations, report)
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)
     report = report.configured(config)
-    given = Given(known, compared)
+    further = Given(held, compared)
     sources, places = plan_sources(sources, place, config, printer)
     if report.score and (runs := [source for source in sources if source not in places]):
         why = f"{escaped(str(runs[0]))} is a run, which holds no poses of other topics"
@@ -110,10 +110,10 @@ def dropout_report_command(
         if number:
             printer.text("")
         with inputs.each(source) as document:
-            found = report_one(source, places.get(source), config, report, files, given, printer)
-            reports[str(source)] = found
+            dropout = report_one(source, places.get(source), config, report, files, further, printer)
+            reports[str(source)] = dropout
             if printer.as_json:
-                document["report"] = found.document
+                document["report"] = dropout.document
     printer.json("dropout-report", {"reports": inputs.documents})
     outcomes = [(str(source), (inputs.errors | reports)[str(source)]) for source in sources]
     exports.write(
@@ -164,7 +164,7 @@ class Given(NamedTuple):
 
 
 def report_one(
-    source: Path, place: Place | None, config: Config, request: ReportRequest, files: ResultFiles, given: Given,
+    source: Path, place: Place | None, config: Config, request: ReportRequest, files: ResultFiles, further: Given,
     printer: Printer,
 ) -> DropoutReport:  # fmt: skip
     """Report on one source; `place` is the run directory of a log, None for a run."""
@@ -178,13 +178,13 @@ def report_one(
         if request.outage_at_s and not dropout_report.forced_lengths_s(run, request):
             raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
         baseline = None
-        if given.baseline is not None:
+        if further.baseline is not None:
             robot = run.document.config.robot.name or ""
-            baseline = given.baseline.find(run.name, run.document.content, robot)
+            baseline = further.baseline.find(run.name, run.document.content, robot)
         with printer.stages(LogText(run.name)) as stages:
             report = pipeline.report_into(
                 folder, run, request, files, stages.begin, log=None if place is None else source,
-                calibrations=given.calibrations, baseline=baseline,
+                calibrations=further.calibrations, baseline=baseline,
             )  # fmt: skip
     if report.baseline is not None:
         printer.warn(f"{run.name}: {change}" for change in report.baseline.changes(run.document))

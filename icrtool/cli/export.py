@@ -78,14 +78,14 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
     if output is not None:
         atomic.check_place(output)
     if target in CONTROLLERS or target == LOCALIZATION:
-        name, found, run = read_calibration_and_run(source, force=force, advice=f"; {ALL_THE_SAME}")
-        if (reasons := record.unfit_reasons(found)) and not force:
+        name, calibration, run = read_calibration_and_run(source, force=force, advice=f"; {ALL_THE_SAME}")
+        if (reasons := record.unfit_reasons(calibration)) and not force:
             advice = f"calibrate with other logs; {ALL_THE_SAME}"
             raise errors.DataError(name, f"not fit for use: {reasons[0].text}", advice)
         if target == LOCALIZATION:
-            text = localization_file.format_localization(found, localization.localization(found, run))
+            text = localization_file.format_localization(calibration, localization.localization(calibration, run))
         else:
-            text = controllers.format_export(found, cast(ControllerTarget, target))
+            text = controllers.format_export(calibration, cast(ControllerTarget, target))
     else:
         run = _run(source, output)
         if target == "foxglove" and output is not None:

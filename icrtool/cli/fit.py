@@ -120,13 +120,13 @@ def fitted_log(
             warm_start=warm_start,
             share=stages.share,
             note=reported.append,
-        ) as found,  # fmt: skip
+        ) as run_and_directory,  # fmt: skip
     ):
-        yield found
+        yield run_and_directory
     if warns:
-        printer.warn_of(found[0])
+        printer.warn_of(run_and_directory[0])
     printer.warn(reported)
-    for line in text_format.jump_lines(found[0].document.reference_jumps):
+    for line in text_format.jump_lines(run_and_directory[0].document.reference_jumps):
         printer.detail(line)
 
 
@@ -154,7 +154,7 @@ def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSo
 
 
 def _examine(
-    log: Path, config: Config, request: FitRequest, given: list[str], document: dict[str, Any], printer: Printer
+    log: Path, config: Config, request: FitRequest, options_given: list[str], document: dict[str, Any], printer: Printer
 ) -> None:
     """Read and fit a log, and print whether it can be fitted, what it holds, and the command to run next.
 
@@ -182,20 +182,20 @@ def _examine(
     holds = read_log.survey_document(survey) if survey is not None else None
     # What errors and warnings of the log begin with: its name, or its path.
     names = (survey.name if survey is not None else LogText(log.stem), escaped(str(log)))
-    command = overview.next_command(escaped(str(log)), given, run)
+    command = overview.next_command(escaped(str(log)), options_given, run)
     used = [stream.topic for stream in measured.streams if stream.role == "gnss"] if measured is not None else []
     scorable = topic_poses.scorable_topics(holds, used) if holds is not None else ()
-    found = survey.problems if survey is not None else ()
+    findings = survey.problems if survey is not None else ()
     if measured is not None:
-        found = measured.notes if run is None else run.notes
-    warnings = notes.warnings_of(found)
+        findings = measured.notes if run is None else run.notes
+    warnings = notes.warnings_of(findings)
     if printer.as_json:
         document.update(
             {
                 "reason": None,
                 **(plain_data.plain(holds) if holds is not None else {}),
                 "streams": plain_data.plain(measured.streams) if measured is not None else [],
-                "notes": plain_data.plain(found),
+                "notes": plain_data.plain(findings),
                 "warnings": list(warnings),
                 "verdict": overview.verdict(run, problem, names),
                 "next": command,

@@ -48,30 +48,30 @@ def runs_or_logs(place: Path) -> list[Path]:
         if fleet_files.is_fleet(place):
             return [run for runs in fleet_files.runs_of_fleet(place).values() for run in runs]
         runs = sorted(file.parent for file in place.rglob(run_directory.RUN_FILE))
-        if found := [run for run in runs if run_directory.is_run_directory(run)]:
-            return found
+        if of_icrtool := [run for run in runs if run_directory.is_run_directory(run)]:
+            return of_icrtool
     return [one.path for one in recordings.find_recordings([place])]
 
 
 def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run]:
     """Read runs, and fit logs with the filter alone, without a recommended model; nothing is written."""
-    found = []
+    runs = []
     with printer.progress("reading") as progress:
         for path in paths:
             printer.detail(str(path))
             if run_directory.is_run_directory(path):
-                found.append(run_directory.open_run(path))
+                runs.append(run_directory.open_run(path))
             else:
-                found.append(fit.fit_filter(read_log.read_log(path, config), config, requests.FitRequest()))
-            progress(len(found) / len(paths))
-    return found
+                runs.append(fit.fit_filter(read_log.read_log(path, config), config, requests.FitRequest()))
+            progress(len(runs) / len(paths))
+    return runs
 
 
 def check_run_config(config: Config, *, free: str = "") -> None:
     """Refuse settings for a finished run, except settings of section `free`, which a report may change."""
-    if given := sorted({key.partition(".")[0] for key in config.given} - {free}):
+    if sections := sorted({key.partition(".")[0] for key in config.given} - {free}):
         advice = "fit the log again with it, or name the log in place of its run"
-        raise errors.ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
+        raise errors.ConfigError(f"[{sections[0]}]", "a finished run keeps the configuration it was made with", advice)
 
 
 def is_log(source: Path) -> bool:
@@ -158,8 +158,8 @@ def _expanded(place: Path) -> list[Path]:
     """Return the files of a pattern, which a shell does not expand after ``NAME=``; without one, the place itself."""
     if isinstance(place, UrlPath) or place.exists() or not glob.has_magic(str(place)):
         return [place]
-    found = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute
-    return [Path(one) for one in found] or [place]
+    files = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute
+    return [Path(one) for one in files] or [place]
 
 
 def named_place(source: str) -> tuple[LogText, Path]:
@@ -185,12 +185,12 @@ def grounds_of(sources: tuple[str, ...]) -> tuple[list[Path], list[str]]:
         The table of the batch cannot be read.
     """
     places = [named_place(source) for source in sources]
-    named = [place_of(source) != path for source, (_, path) in zip(sources, places, strict=True)]
-    if len(places) == 1 and not named[0] and fleet_files.is_fleet(places[0][1]):
-        found = [(name, run) for name, runs in fleet_files.runs_of_fleet(places[0][1]).items() for run in runs]
-        return [run for _, run in found], [str(name) for name, _ in found]
-    if any(named) and not all(named):
-        without = escaped(str(places[named.index(False)][1]))
+    have_ground = [place_of(source) != path for source, (_, path) in zip(sources, places, strict=True)]
+    if len(places) == 1 and not have_ground[0] and fleet_files.is_fleet(places[0][1]):
+        of_grounds = [(name, run) for name, runs in fleet_files.runs_of_fleet(places[0][1]).items() for run in runs]
+        return [run for _, run in of_grounds], [str(name) for name, _ in of_grounds]
+    if any(have_ground) and not all(have_ground):
+        without = escaped(str(places[have_ground.index(False)][1]))
         raise errors.ConfigError(without, "has no name of a ground", "write NAME= before each argument, or before none")
-    found = [(str(name), one) for name, place in places for path in _expanded(place) for one in runs_or_logs(path)]
-    return [one for _, one in found], [name for name, _ in found] if all(named) else []
+    of_grounds = [(str(name), one) for name, place in places for path in _expanded(place) for one in runs_or_logs(path)]
+    return [one for _, one in of_grounds], [name for name, _ in of_grounds] if all(have_ground) else []

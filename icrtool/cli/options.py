@@ -57,12 +57,12 @@ class _Positive(click.FloatRange):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401 - as click has it
         """Return the number, or fail with what to type."""
-        found = re.fullmatch(r"\s*(\d*\.?\d+)\s*([a-zA-Zµ]+)\s*", value) if isinstance(value, str) else None
-        if found is None or found[2].lower() in ("inf", "nan", "e"):
+        with_unit = re.fullmatch(r"\s*(\d*\.?\d+)\s*([a-zA-Zµ]+)\s*", value) if isinstance(value, str) else None
+        if with_unit is None or with_unit[2].lower() in ("inf", "nan", "e"):
             return super().convert(value, param, ctx)
         unit = param.metavar.lower() if param is not None and isinstance(param.metavar, str) else "units"
-        scale = METRES_OF_UNIT.get(found[2]) if unit == "metres" else None
-        meant = f", here {float(found[1]) * scale:g}" if scale is not None else ""
+        scale = METRES_OF_UNIT.get(with_unit[2]) if unit == "metres" else None
+        meant = f", here {float(with_unit[1]) * scale:g}" if scale is not None else ""
         raise click.BadParameter(f"{value!r} has a unit; give the number of {unit} alone{meant}", ctx, param)
 
 
@@ -85,8 +85,8 @@ class GroupedCommand(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options of the help."""
-        given = [one for one in self.get_params(ctx) if isinstance(one, click.Option)]
-        shown = [(one, found) for one in given if (found := one.get_help_record(ctx)) is not None]
+        declared = [one for one in self.get_params(ctx) if isinstance(one, click.Option)]
+        shown = [(one, found) for one in declared if (found := one.get_help_record(ctx)) is not None]
         places = {f"--{name}": place for place, name in enumerate(USUAL)}
 
         def place(one: click.Parameter) -> int | None:
@@ -140,16 +140,18 @@ def together(name: str, home: str | Callable[..., Any], *options: Option, change
     change : the argument is a function that returns a dataclass with the given options changed
     """
     bare = add_options(lambda: None, *options)
-    known = {one.name for one in bare.__dict__.get("__click_params__", ())}.union(bare.__dict__.get("made", ()))
+    of_record = {one.name for one in bare.__dict__.get("__click_params__", ())}.union(bare.__dict__.get("made", ()))
 
     def add(command: Command) -> Command:
         @wraps(command)
-        def call(**given: Any) -> object:
+        def call(**arguments: Any) -> object:
             record = resolve_name(home) if isinstance(home, str) else home
-            taken = {one: given.pop(one) for one in known.intersection(signature(record).parameters, given)}
-            values = {one: value for one, value in taken.items() if value is not None}
-            made = (lambda old: replace(old, **values)) if change else record(**values)
-            return command(**{name: made}, **given)
+            fields = {
+                one: arguments.pop(one) for one in of_record.intersection(signature(record).parameters, arguments)
+            }
+            values = {one: value for one, value in fields.items() if value is not None}
+            record_or_change = (lambda old: replace(old, **values)) if change else record(**values)
+            return command(**{name: record_or_change}, **arguments)
 
         call.__dict__["made"] = {name, *command.__dict__.get("made", ())}
         return add_options(call, *options)
@@ -210,12 +212,12 @@ def numbers(form: str, count: int | None = None) -> Callable[[str], tuple[float,
 
     def read(text: str) -> tuple[float, ...]:
         try:
-            found = tuple(float(part) for part in text.split(","))
+            values = tuple(float(part) for part in text.split(","))
         except ValueError:
-            found = ()
-        if len(found) != (count or len(found)) or not found or not all(map(math.isfinite, found)):
+            values = ()
+        if len(values) != (count or len(values)) or not values or not all(map(math.isfinite, values)):
             raise click.BadParameter(f"{text!r} is not of the form {form}")
-        return found
+        return values
 
     return read
 
@@ -342,10 +344,10 @@ def plot_formats(text: str) -> tuple[str, ...]:
     asked = tuple(part.strip().lower() for part in text.split(",") if part.strip())
     if asked == ("none",):
         return ()
-    known = formats.PLOT_FORMATS
-    unknown = [part for part in asked if part not in known]
+    formats_known = formats.PLOT_FORMATS
+    unknown = [part for part in asked if part not in formats_known]
     if unknown or not asked:
-        raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of {', '.join(known)}, none")
+        raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of {', '.join(formats_known)}, none")
     return asked
 
 

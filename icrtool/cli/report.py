@@ -69,7 +69,7 @@ def report_command(
       icrtool report results/
       icrtool report season.json
     """  # noqa: D301 - click reads the escape
-    given = dropout_report.Given(options.calibrations_of(calibrations, report), None)
+    further = dropout_report.Given(options.calibrations_of(calibrations, report), None)
     config = settings.load()
     sources = sources or (run_directory.newest_run(RUNS_FOLDER),)
     if output is not None and len(sources) > 1:
@@ -89,7 +89,7 @@ def report_command(
             result = source
             if source in places:
                 files = requests.ResultFiles(overwrite=overwrite, page=output is None and not no_coordinates)
-                _report_on_log(source, places[source], config, report, files, given, printer)
+                _report_on_log(source, places[source], config, report, files, further, printer)
                 if files.page:
                     continue
                 result = path_of(places[source])
@@ -99,15 +99,15 @@ def report_command(
 
 def _report_on_log(
     source: Path, place: Place, config: Config, report: requests.ReportRequest, files: requests.ResultFiles,
-    given: dropout_report.Given, printer: Printer,
+    further: dropout_report.Given, printer: Printer,
 ) -> None:  # fmt: skip
     """Print what a log shows, fitted unless its run is there, and write its run and report."""
     request = report.configured(config)
     there = run_directory.holds_run_of(path_of(place), source, config, request.fit)
     if there:
-        dropout_report.report_one(path_of(place), None, config, request, files, given, printer)
+        dropout_report.report_one(path_of(place), None, config, request, files, further, printer)
     else:
-        dropout_report.report_one(source, place, config, request, files, given, printer)
+        dropout_report.report_one(source, place, config, request, files, further, printer)
 
 
 def _write_page(source: Path, output: Path | None, *, coordinates: bool, printer: Printer) -> None:
@@ -153,8 +153,8 @@ def _page_of_run(directory: Path, *, coordinates: bool) -> str:
     if "trajectory" not in pictures:
         pictures = pages.draw_pictures(run) | pictures
     if report is None:
-        made = analysis.dropout_report(run).document
-        return pages.run_page(run, made, pictures, coordinates=coordinates)
+        document = analysis.dropout_report(run).document
+        return pages.run_page(run, document, pictures, coordinates=coordinates)
     with _as_written(directory / "dropout", "make it again with icrtool dropout-report"):
         return pages.run_page(run, report, pictures, coordinates=coordinates)
 
@@ -198,12 +198,12 @@ def compare_command(
       icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
     """  # noqa: D301 - click reads the escape
     config = settings.load()
-    found = [
+    calibrations = [
         (name, one) for name, places in groups_of(sources).items() for path in places for one in runs_or_logs(path)
     ]
     groups: dict[str, list[Run]] = {}
-    runs = runs_named([path for _, path in found], config, printer)
-    for (name, _), run in zip(found, runs, strict=True):
+    runs = runs_named([path for _, path in calibrations], config, printer)
+    for (name, _), run in zip(calibrations, runs, strict=True):
         groups.setdefault(name, []).append(run)
     compared = transfer.compare_groups(groups)
     for file, content in ((csv, tables.transfer_csv(compared)), (output, formats.json_bytes(compared))):

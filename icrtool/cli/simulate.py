@@ -200,8 +200,8 @@ def simulate_command(
     counts = encoder_counts or config.robot.encoder_counts_per_rev or PAPER_COUNTS
     radius_m = needed(config, "wheel_radius_m")
     metres = 2 * math.pi * radius_m / counts
-    given = drives.Sensors(metres_per_count=metres, antenna_forward_m=antenna[0], antenna_right_m=antenna[1])
-    sensed = sensors(given)
+    sensors_given = drives.Sensors(metres_per_count=metres, antenna_forward_m=antenna[0], antenna_right_m=antenna[1])
+    sensed = sensors(sensors_given)
     rate = wheel_rate or (COMMAND_RATE_HZ if sensed.wheels == "commanded" else ENCODER_RATE_HZ)
     sensed = replace(sensed, wheel_rate_hz=rate)
     if sensed.wheels == "commanded":
@@ -322,8 +322,8 @@ def study_command(
     Example:
       icrtool study convergence --robot husky-a200 --wheels encoder --gnss waas
     """  # noqa: D301 - click reads the escape
-    config, given = settings.load(), click.get_current_context().params
-    check_varied(studies.STUDIES[name], name, given)
+    config, arguments = settings.load(), click.get_current_context().params
+    check_varied(studies.STUDIES[name], name, arguments)
     asked, robot = request(studies.default_request(name, config)), config.robot
     driven, drive, sensed = path(asked.path), asked.plan, sensors(asked.sensors)
     if robot.track_width_m is not None:
@@ -337,7 +337,7 @@ def study_command(
     if robot.wheel_radius_m is not None:
         counts = encoder_counts or robot.encoder_counts_per_rev or PAPER_COUNTS
         sensed = replace(sensed, metres_per_count=2 * math.pi * robot.wheel_radius_m / counts)
-    paths = (driven.kind,) if given["kind"] is not None and asked.paths else asked.paths
+    paths = (driven.kind,) if arguments["kind"] is not None and asked.paths else asked.paths
     if preset is None and "filter.preset" in config.given:
         preset = config.filter.preset
     if preset is None and name == "convergence" and robot.track_width_m is not None:
@@ -354,10 +354,15 @@ def study_command(
     printer.detail(f"settings: {asked.settings()}")
 
 
-def check_varied(study: Study, name: str, given: Mapping[str, object]) -> None:
-    """Refuse an option for what a study varies, and values where it varies no number; `given`: the options by name."""
-    if given.get(study.varied) is not None:
+def check_varied(study: Study, name: str, arguments: Mapping[str, object]) -> None:
+    """Refuse an option for what a study varies, and values where it varies no number.
+
+    Parameters
+    ----------
+    arguments : the options by name
+    """
+    if arguments.get(study.varied) is not None:
         option = next(one.opts[0] for one in study_command.params if one.name == study.varied)
         raise click.UsageError(f"{option} is what study {name} varies; --values V,V,... sets where")
-    if given["values"] is not None and not study.varies:
+    if arguments["values"] is not None and not study.varies:
         raise click.UsageError(f"study {name} varies no number; it takes no --values")

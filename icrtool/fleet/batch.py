@@ -134,8 +134,10 @@ def _request_for(
     # The key does not depend on whether a page is asked for: `find_finished_row` looks for the file report.html.
     files = replace(batch.files, page=True, overwrite=False)
     # The stem is in the name of the row.
-    named = [(as_text(file.stem), one.sha256) for file, one in zip(batch.calibrations, calibrations, strict=True)]
-    keyed = [config.effective(), __version__, batch.report, files, about.robot, baseline, *named]
+    named_calibrations = [
+        (as_text(file.stem), one.sha256) for file, one in zip(batch.calibrations, calibrations, strict=True)
+    ]
+    keyed = [config.effective(), __version__, batch.report, files, about.robot, baseline, *named_calibrations]
     row = FleetLog(
         recording.log, f"{RUNS}/{recording.name}", "failed", robot=about.robot or config.robot.name or "",
         group=about.group, tags=about.tags, key=sha256(msgspec.json.encode(keyed, order="sorted")).hexdigest(),
@@ -262,12 +264,12 @@ def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
     return True
 
 
-def _is_unchanged(before: FleetFile, path: UrlPath) -> bool:
+def _is_unchanged(stored: FleetFile, path: UrlPath) -> bool:
     """Return whether the file at an address still has the size and version of the earlier batch."""
     try:
         now = RemoteFile(path)
     except LogError:
         return False
     version = next(iter(now.version.values()), "")
-    stated = now.size, version, before.address and path.digest
-    return bool(version) and stated == (before.bytes, before.version, before.address)
+    state = now.size, version, stored.address and path.digest
+    return bool(version) and state == (stored.bytes, stored.version, stored.address)

@@ -73,8 +73,8 @@ def check_tables(folder: Path, *, page: bool) -> None:
     """
     if page and folder.is_dir():
         check_place(Below(folder, PAGE_FILE), is_page)
-    stated = formats.schema_of(Below(folder, FLEET_FILE))
-    if stated.startswith(documents.FLEET_FAMILY) or (folder / ROWS).is_dir():
+    schema = formats.schema_of(Below(folder, FLEET_FILE))
+    if schema.startswith(documents.FLEET_FAMILY) or (folder / ROWS).is_dir():
         return
     for file in (*(folder / name for name in TABLES), *pictures_of_batch(folder)):
         if file.exists() and not file.is_symlink():
@@ -105,18 +105,18 @@ def fleet_rows(rows: Sequence[FleetLog]) -> list[dict[str, object]]:
     errors = list(dict.fromkeys(name for row in rows for name in row.errors))
     table = []
     for row in rows:
-        found: dict[str, object] = {name: getattr(row, name) for name in BEFORE_ICRS}
-        found |= {name: row.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{one}" for one in ICR_COLUMNS))}
-        found |= {"multiplier": row.multiplier, "multiplier_std": row.multiplier_std}
+        cells: dict[str, object] = {name: getattr(row, name) for name in BEFORE_ICRS}
+        cells |= {name: row.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{one}" for one in ICR_COLUMNS))}
+        cells |= {"multiplier": row.multiplier, "multiplier_std": row.multiplier_std}
         for name in errors:
-            found[name] = row.errors.get(name)
+            cells[name] = row.errors.get(name)
             if WITHIN in name:
-                is_bound = None if found[name] is None else int(name in row.bounds)
-                found[f"{name.removesuffix('_m')}{IS_BOUND}"] = is_bound
-        found |= {name: getattr(row, name) for name in AFTER_ERRORS}
+                is_bound = None if cells[name] is None else int(name in row.bounds)
+                cells[f"{name.removesuffix('_m')}{IS_BOUND}"] = is_bound
+        cells |= {name: getattr(row, name) for name in AFTER_ERRORS}
         limits = row.gates_failed if row.status != "failed" else None
         listed = {"tags": ";".join(row.tags), "notes": ";".join(row.codes)}
-        table.append(found | listed | {"gates_failed": limits, "took_s": row.took_s})
+        table.append(cells | listed | {"gates_failed": limits, "took_s": row.took_s})
     return table
 
 
@@ -186,8 +186,8 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
 
     points: list[FleetLog] = []
     errors: dict[str, dict[str, float]] = {}
-    known = {name for row in rows for name in row.errors}
-    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", documents.SHOWN_FALLBACK))
+    names = {name for row in rows for name in row.errors}
+    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in names), ("", documents.SHOWN_FALLBACK))
     for row in sorted(rows, key=lambda row: row.start_utc):
         shown = all(row.icr.get(name) is not None for name in ("y_icr_right_m", "y_icr_left_m"))
         if shown and row.start_utc:
@@ -267,19 +267,19 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
 
 def changes_of(rows: Sequence[FleetLog], missing: Sequence[str]) -> list[str]:
     """Return how the logs, their configuration and the version differ from the baseline, a sentence each."""
-    found = [f"not in this batch, but in the baseline: {', '.join(missing)}"] if missing else []
+    lines = [f"not in this batch, but in the baseline: {', '.join(missing)}"] if missing else []
     new = [row.log for row in rows if row.status != "failed" and not row.baseline]
     if new and len(new) < len(rows):
-        found.append(f"not in the baseline: {', '.join(new)}")
+        lines.append(f"not in the baseline: {', '.join(new)}")
     by_change: dict[str, list[str]] = {}
     for row in rows:
         for change in row.changes:
             by_change.setdefault(change, []).append(row.log)
-    found += [
+    lines += [
         f"{', '.join(logs) if len(logs) < len(rows) or len(rows) == 1 else 'all logs'}: {change}"
         for change, logs in by_change.items()
     ]
-    return found
+    return lines
 
 
 def pooled_calibrations(
@@ -294,9 +294,9 @@ def pooled_calibrations(
     allow_unusable : also from runs that are not usable
     """
     try:
-        before = {one.key: one for one in formats.read_fleet(directory).calibrations}
+        stored = {one.key: one for one in formats.read_fleet(directory).calibrations}
     except (OSError, ValueError, RecursionError):
-        before = {}
+        stored = {}
     groups: dict[tuple[str, str], list[FleetLog]] = {}
     for row in rows:
         if row.status != "failed":
@@ -309,9 +309,9 @@ def pooled_calibrations(
         text = "-".join(part for part in (robot, group) if part)
         name = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in text)[:100].strip(".")
         name = unique_name(name or "all", names)
-        known = before.get(key)
-        if known is not None and (not known.file or is_regular(Below(directory, known.file))):
-            yield known
+        unchanged = stored.get(key)
+        if unchanged is not None and (not unchanged.file or is_regular(Below(directory, unchanged.file))):
+            yield unchanged
         else:
             empty = FleetCalibration(robot, group, tuple(row.log for row in members), key=key)
             yield _pooled(empty, members, directory, place or directory, name, allow_unusable=allow_unusable)
@@ -329,11 +329,11 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
     """
     logs = [one for one in formats.logs_of_fleet(directory) if one.usable]
     robots = {one.robot for one in logs}
-    found: dict[str, dict[tuple[str, ...], Path]] = {}
+    by_group: dict[str, dict[tuple[str, ...], Path]] = {}
     for one in logs:
         name = one.group if one.group and len(robots) == 1 else f"{one.robot} {one.group}".strip() or directory.name
-        found.setdefault(name, {}).setdefault(_content(one.inputs), directory / one.run)
-    return {name: list(runs.values()) for name, runs in found.items()}
+        by_group.setdefault(name, {}).setdefault(_content(one.inputs), directory / one.run)
+    return {name: list(runs.values()) for name, runs in by_group.items()}
 
 
 def is_fleet(directory: Path) -> bool:

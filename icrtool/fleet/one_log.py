@@ -91,14 +91,14 @@ def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, .
             for one in inputs
         )
     hashes = {file.path: file.sha256 for file in inputs}
-    found = []
+    files = []
     for file in files_of_log(path):
         digest = hashes.get(str(file))
         if digest is None:
             digest = file_sha256(file)
         status = file.stat()
-        found.append(FleetFile(as_text(file), status.st_size, status.st_mtime_ns, digest))
-    return tuple(found)
+        files.append(FleetFile(as_text(file), status.st_size, status.st_mtime_ns, digest))
+    return tuple(files)
 
 
 def _results(request: LogRequest, watch: Watch) -> FleetLog:
@@ -110,20 +110,20 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
     calibrations = [_calibration_of(one) for one in request.calibrations]
     with fit_into(Below(folder, request.known.run), path, request.config, asked.fit, files, watch) as found:
         run, partial = found
-        before = None
+        baseline = None
         if request.baseline:
-            known = request.known
-            before = open_baseline(path_from_bytes(request.baseline)).find(
-                known.log, run.document.content, known.robot, known.group
+            row = request.known
+            baseline = open_baseline(path_from_bytes(request.baseline)).find(
+                row.log, run.document.content, row.robot, row.group
             )
-        report = report_into(partial, run, asked, files, watch, calibrations=calibrations, baseline=before)
+        report = report_into(partial, run, asked, files, watch, calibrations=calibrations, baseline=baseline)
     summary = run.document
     icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}
     controller = summary.controller
     if controller is None and report.calibration is not None:
         controller = report.calibration.controller
-    stated = report.document
-    unusable = f"not usable: {stated.unusable_because}" if not stated.usable else ""
+    document = report.document
+    unusable = f"not usable: {document.unusable_because}" if not document.usable else ""
     cut = next((one.sentence for one in summary.notes if one.code == "log_cut_off"), "")
     within = [(f"{one.model}_within_{one.budget_m:g}m_m", one) for one in report.document.budgets]
     earlier = report.baseline.document.models if report.baseline is not None else ()
@@ -131,7 +131,7 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
         request.known,
         status="done",
         reason="; ".join(filter(None, [unusable, f"truncated: {cut}" if cut else ""])),
-        usable=stated.usable,
+        usable=document.usable,
         start_utc=datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary.drive.duration_s,
         distance_m=summary.drive.distance_m,
@@ -157,7 +157,7 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
     )
 
 
-def _calibration_of(given: CalibrationInput) -> Calibration:
+def _calibration_of(input_file: CalibrationInput) -> Calibration:
     """Read a calibration file, whose digest is in the key of the row.
 
     Raises
@@ -169,8 +169,8 @@ def _calibration_of(given: CalibrationInput) -> Calibration:
     """
     from icrtool.output.files.formats import open_calibration
 
-    file = path_from_bytes(given.path)
-    if file_sha256(file) != given.sha256:
+    file = path_from_bytes(input_file.path)
+    if file_sha256(file) != input_file.sha256:
         raise LogChangedError(file, "changed since the batch began", "run the batch again")
     return open_calibration(file)
 

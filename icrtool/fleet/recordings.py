@@ -75,15 +75,17 @@ def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
         if not (isinstance(place, UrlPath) or place.exists() or split_files(place)):
             raise LogError(place, "no such file or directory")
     logs, _ = logs_among(places)
-    found = joined({os.path.realpath(log): log for log in logs if not log.is_dir() or is_bag_directory(log)})
-    if not found:
+    recordings = joined({os.path.realpath(log): log for log in logs if not log.is_dir() or is_bag_directory(log)})
+    if not recordings:
         what = places[0] if len(places) == 1 else f"{len(places)} places"
         raise LogError(what, "no recording in it", "a log is an .mcap, .bag or .db3 file, or a ROS 2 bag directory")
-    root = common_parent(places if not any(isinstance(place, UrlPath) for place in places) else list(found.values()))
-    return _named(sorted(found.values(), key=natural_order), root)
+    root = common_parent(
+        places if not any(isinstance(place, UrlPath) for place in places) else list(recordings.values())
+    )
+    return _named(sorted(recordings.values(), key=natural_order), root)
 
 
-def joined(found: Mapping[str, Path]) -> dict[str, Path]:
+def joined(logs: Mapping[str, Path]) -> dict[str, Path]:
     """Return recordings in which the files of a split recording, or of a restarted recorder, are joined to one.
 
     They are files of one folder whose names differ only in a count or a date, that have the same topics, and of which
@@ -91,10 +93,10 @@ def joined(found: Mapping[str, Path]) -> dict[str, Path]:
 
     Parameters
     ----------
-    found : paths by real path; the single files of a split recording that is also in `found` are left out
+    logs : paths by real path; the single files of a split recording that is also in `logs` are left out
     """
-    of_ranges = {os.path.realpath(file) for path in found.values() for file in split_files(path)}
-    single = {real: path for real, path in found.items() if real not in of_ranges}
+    of_ranges = {os.path.realpath(file) for path in logs.values() for file in split_files(path)}
+    single = {real: path for real, path in logs.items() if real not in of_ranges}
     series: dict[tuple[Path, str, str], list[NumberedFile]] = {}
     for path in single.values():
         if path.suffix in LOG_SUFFIXES and path.is_file() and (one := numbered_file(path)) is not None:
@@ -145,24 +147,24 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     the name of a recording among `places` (``drive.json`` next to ``drive.mcap``, from a pattern of the shell) is left
     out.
     """
-    found: dict[str, Path] = {}
+    by_path: dict[str, Path] = {}
     for place in places:
         if isinstance(place, UrlPath):
-            found |= {path.url: path for path in find(place)}
+            by_path |= {path.url: path for path in find(place)}
             continue
         searched = place.is_dir() and not is_bag_directory(place) and not (place / RUN_FILE).is_file()
         below = {os.path.realpath(path): path for path in sorted(_search(place), key=natural_order)} if searched else {}
         for real, path in (joined(below) or {os.path.realpath(place): place}).items():
-            found.setdefault(real, path)
-    logs = list(found.values())
+            by_path.setdefault(real, path)
+    logs = list(by_path.values())
     recordings = [path for path in logs if path.is_dir() or is_recording(path)]
     stems = {_absolute(path).parent / f"{log_name(path)}." for path in recordings}
     others = []
     for path in logs:
         # A file with a recording's name and another suffix: drive.truth.csv next to drive.bag.
         file, parts = _absolute(path), path.name.split(".")
-        named = {file.parent / f"{'.'.join(parts[:k])}." for k in range(1, len(parts))}
-        if path not in recordings and file.is_file() and not stems.isdisjoint(named):
+        beginnings = {file.parent / f"{'.'.join(parts[:k])}." for k in range(1, len(parts))}
+        if path not in recordings and file.is_file() and not stems.isdisjoint(beginnings):
             others.append(path)
     return [path for path in logs if path not in others], others
 
@@ -344,14 +346,14 @@ def read_manifest(path: Path) -> list[ManifestEntry]:
 
 def about_recording(path: Path, entries: Sequence[ManifestEntry]) -> About:
     """Return what a manifest states about a recording; a later line adds to and replaces an earlier one."""
-    found = About()
+    about = About()
     whole = _target(path)
     around = {whole, *whole.parents}
     for entry in entries:
         if not around.isdisjoint(entry.targets):
-            stated = {key: value for key in ("robot", "config", "group") if (value := getattr(entry.about, key))}
-            found = replace(found, **stated, tags=tuple(dict.fromkeys((*found.tags, *entry.about.tags))))
-    return found
+            of_entry = {key: value for key in ("robot", "config", "group") if (value := getattr(entry.about, key))}
+            about = replace(about, **of_entry, tags=tuple(dict.fromkeys((*about.tags, *entry.about.tags))))
+    return about
 
 
 def _target(place: Path) -> Path:
@@ -390,15 +392,15 @@ def _matching(path: Path, pattern: str) -> tuple[Path, ...]:
     """Return what a pattern matches; a file whose own name has a bracket or a star is taken as it is."""
     if isinstance(address := place_of(pattern), UrlPath):
         return tuple(find(address))
-    named = path.parent / pattern
+    full_pattern = path.parent / pattern
     try:
-        if named.exists():
-            return (named,)
-        base = Path(named.anchor) if Path(pattern).is_absolute() else path.parent
+        if full_pattern.exists():
+            return (full_pattern,)
+        base = Path(full_pattern.anchor) if Path(pattern).is_absolute() else path.parent
         relative = str(Path(pattern).relative_to(base)) if Path(pattern).is_absolute() else pattern
-        found = tuple(sorted(base.glob(relative)))
+        matches = tuple(sorted(base.glob(relative)))
     except (ValueError, NotImplementedError, OSError, RecursionError) as err:
         raise ConfigError(f"{path}: log", f"{pattern!r} is not a pattern", str(err)) from err
-    if not found:
+    if not matches:
         raise ConfigError(f"{path}: log", f"{pattern!r} matches nothing", f"it is relative to {path.parent}")
-    return found
+    return matches

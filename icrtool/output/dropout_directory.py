@@ -228,8 +228,8 @@ class Baseline:
         ConfigError
             The report cannot be read.
         """
-        if (found := self.own_report(name, content)) is not None:
-            return read_baseline(below(self.folder, self.reports[found]), found)
+        if (own_log := self.own_report(name, content)) is not None:
+            return read_baseline(below(self.folder, self.reports[own_log]), own_log)
         if not (drives := self.drives_of(robot, group)):
             return None
         pooled = [read_baseline(below(self.folder, self.reports[log]), log).document for log in drives]
@@ -237,10 +237,10 @@ class Baseline:
 
     def own_report(self, name: str, content: Collection[str]) -> str | None:
         """Return which log's report is that of a log; None where it is in none, and only others can stand for it."""
-        found = next((log for log, files in self.sha256.items() if content and set(content) <= set(files)), None)
-        if found is None and self.path.is_file():
-            found = next(iter(self.reports))
-        return found if found is not None else name if name in self.reports else None
+        same_log = next((log for log, files in self.sha256.items() if content and set(content) <= set(files)), None)
+        if same_log is None and self.path.is_file():
+            same_log = next(iter(self.reports))
+        return same_log if same_log is not None else name if name in self.reports else None
 
     def drives_of(self, robot: str, group: str = "") -> list[str]:
         """Return the usable drives of a robot, in one group where both are known; none of a robot without a name."""

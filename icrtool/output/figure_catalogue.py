@@ -33,10 +33,10 @@ ONCE: Parts = {"": ()}
 def _histograms(report: DropoutReport, *, together: bool) -> Parts:
     """Return the parts of histograms: one figure of all horizons that have trials, or one of each."""
     trials = {row.horizon_m: row.trials for row in report.document.trials}
-    found = tuple(metres for metres in HISTOGRAM_HORIZONS_M if trials.get(metres))
+    horizons_m = tuple(metres for metres in HISTOGRAM_HORIZONS_M if trials.get(metres))
     if together:
-        return {"": found} if found else {}
-    return {f"{metres:02.0f}m": (metres,) for metres in found}
+        return {"": horizons_m} if horizons_m else {}
+    return {f"{metres:02.0f}m": (metres,) for metres in horizons_m}
 
 
 class Entry(NamedTuple):
@@ -175,21 +175,21 @@ def drive_charts(position_word: str) -> tuple[Chart, ...]:
 
 
 def figures_of(
-    of: Subject, subject: object, figures: FigureSet = "default", watch: Watch = unwatched
+    kind: Subject, subject: object, figures: FigureSet = "default", watch: Watch = unwatched
 ) -> Iterator[tuple[str, Figure]]:
     """Draw each figure for which a subject has numbers; yield it with the name of its file.
 
     `watch` is called with the name of each picture before it is drawn.
     """
     for name, entry in FIGURES.items():
-        if entry.of == of and (figures == "all" or not entry.further):
-            for part, more in entry.parts(subject).items():
+        if entry.of == kind and (figures == "all" or not entry.further):
+            for part, arguments in entry.parts(subject).items():
                 watch(f"picture {name}{part}")
-                yield f"{name}{part}", entry.draw(subject, *more)
+                yield f"{name}{part}", entry.draw(subject, *arguments)
 
 
 def draw_figures(
-    of: Subject, subject: object, directory: Path, formats: tuple[str, ...], figures: FigureSet = "default",
+    kind: Subject, subject: object, directory: Path, formats: tuple[str, ...], figures: FigureSet = "default",
     watch: Watch = unwatched,
 ) -> None:  # fmt: skip
     """Write the figures of a run or a report into a directory.
@@ -208,7 +208,7 @@ def draw_figures(
     directory.mkdir(exist_ok=True)
     from icrtool.output.figures.style import save_figure
 
-    for name, figure in figures_of(of, subject, figures, watch):
+    for name, figure in figures_of(kind, subject, figures, watch):
         save_figure(figure, directory / name, formats)
 
 

@@ -142,9 +142,9 @@ def changed_settings(directory: Path, config: Config, request: FitRequest) -> li
         return []
     now: dict[str, Any] = config.effective() | {"request": msgspec.to_builtins(request)}
     before: dict[str, Any] = {**asked.config, "request": asked.request}
-    named = {"request.start": "--from", "request.end": "--to", "request.changes_s": "--terrain-change"}
+    options = {"request.start": "--from", "request.end": "--to", "request.changes_s": "--terrain-change"}
     left_out = {"request.smooth"}
-    found = []
+    changes = []
     for section, values in now.items():
         stored = before.get(section)
         if section == "dropout" or not isinstance(stored, dict):
@@ -152,12 +152,12 @@ def changed_settings(directory: Path, config: Config, request: FitRequest) -> li
         for key, value in values.items():
             name = f"{section}.{key}"
             if name not in left_out and key in stored and not _same(stored[key], value):
-                found.append(f"{named.get(name, name)} was {_stated(stored[key])}, now {_stated(value)}")
-    return found
+                changes.append(f"{options.get(name, name)} was {_stated(stored[key])}, now {_stated(value)}")
+    return changes
 
 
-def _same(one: object, other: object) -> bool:
-    return json.dumps(plain(one), sort_keys=True) == json.dumps(plain(other), sort_keys=True)
+def _same(stored: object, asked: object) -> bool:
+    return json.dumps(plain(stored), sort_keys=True) == json.dumps(plain(asked), sort_keys=True)
 
 
 def _stated(value: object) -> str:
@@ -371,9 +371,9 @@ def log_of(run: Run) -> Path:
     files = [place_of(file.path) for file in run.document.inputs]
     if len(files) == 1 and isinstance(files[0], UrlPath):
         return files[0]
-    gone = [file for file in files if not file.is_file()]
-    if gone or not files:
-        what = gone[0] if gone else "a list of inputs"
+    missing = [file for file in files if not file.is_file()]
+    if missing or not files:
+        what = missing[0] if missing else "a list of inputs"
         why = f"the log it was made from is gone ({what})"
         raise RunError(run.directory or run.name, why, "put it back, or name it")
     folder = files[0].parent
@@ -393,10 +393,10 @@ def newest_run(runs: Path) -> Path:
     RunError
         There is none.
     """
-    found = [file for file in runs.glob(f"*/{RUN_FILE}") if is_run_directory(file.parent)]
-    if not found:
+    run_files = [file for file in runs.glob(f"*/{RUN_FILE}") if is_run_directory(file.parent)]
+    if not run_files:
         raise RunError(runs, "no run in it", "name a run directory or a log, or make a run with icrtool fit")
-    return max(found, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent
+    return max(run_files, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent
 
 
 def _read_document(directory: Path) -> dict[str, Any]:
@@ -448,8 +448,8 @@ def check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
         The sums differ, or the file cannot be read.
     """
     try:
-        found = formats.file_b2sum(Below(directory, name))
+        digest = formats.file_b2sum(Below(directory, name))
     except OSError as err:
         raise RunError(directory, f"{name} is missing or unreadable ({err.strerror})", FIT_AGAIN) from err
-    if found != sums.get(name):
+    if digest != sums.get(name):
         raise RunError(directory, f"{name} was edited or cut short since the run", FIT_AGAIN)

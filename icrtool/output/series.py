@@ -70,8 +70,8 @@ def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
             np.multiply(column, sign, out=padded[:rows])
             padded[:rows][missing] = np.inf
             chosen.append(begin + padded.reshape(-1, width).argmin(axis=1))
-    found = np.unique(np.concatenate(chosen))
-    return found[found < rows]
+    chosen_rows = np.unique(np.concatenate(chosen))
+    return chosen_rows[chosen_rows < rows]
 
 
 def percentiles(column: Floats, shares: tuple[float, ...]) -> list[float]:
@@ -93,12 +93,12 @@ def places(north: Floats, east: Floats, cell_m: float) -> Ints:
     """
     if len(north) == 0:
         return np.empty(0, np.int64)
-    found = [np.array([0, len(north) - 1])]
+    parts = [np.array([0, len(north) - 1])]
     for lo in range(0, len(north), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE + 1)
         moved = (np.diff(np.floor(north[some] / cell_m)) != 0) | (np.diff(np.floor(east[some] / cell_m)) != 0)
-        found.append(lo + 1 + np.flatnonzero(moved))
-    return np.unique(np.concatenate(found))
+        parts.append(lo + 1 + np.flatnonzero(moved))
+    return np.unique(np.concatenate(parts))
 
 
 def scale_of(shown: Sequence[float]) -> tuple[float, float]:

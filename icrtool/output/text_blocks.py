@@ -102,14 +102,14 @@ class Table(NamedTuple):
 
     def lines(self, *, brief: bool = False) -> list[list[str]]:
         """Return the rows as texts, several of a row whose cells have several lines."""
-        found = []
+        rows = []
         for row in self.rows:
             cells = [
                 ((cell.text,) if brief else cell.lines()) if isinstance(cell, Cell) else (str(cell),) for cell in row
             ]
             depth = max(map(len, cells))
-            found += [[cell[line] if line < len(cell) else "" for cell in cells] for line in range(depth)]
-        return found
+            rows += [[cell[line] if line < len(cell) else "" for cell in cells] for line in range(depth)]
+        return rows
 
 
 class Facts(NamedTuple):
@@ -311,12 +311,15 @@ def fitted_to(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
         if widths[widest] <= NARROWEST:
             break
         widths[widest] -= 1
-    kept, left_out = list(range(len(widths))), []
-    while len(kept) > fewest and sum(widths[column] for column in kept) + 2 * (len(kept) - 1) > width:
-        out = kept.pop(len(kept) // 2)
+    columns_kept, left_out = list(range(len(widths))), []
+    while (
+        len(columns_kept) > fewest
+        and sum(widths[column] for column in columns_kept) + 2 * (len(columns_kept) - 1) > width
+    ):
+        out = columns_kept.pop(len(columns_kept) // 2)
         left_out.append(head[0][out] if head else f"column {out + 1}")
-    rows = [[shortened(row[one], widths[one]) if one in texts else row[one] for one in kept] for row in rows]
-    align = "".join(sides[column] for column in kept)
+    rows = [[shortened(row[one], widths[one]) if one in texts else row[one] for one in columns_kept] for row in rows]
+    align = "".join(sides[column] for column in columns_kept)
     return table._replace(align=align, rows=rows[len(head) :], head=rows[0] if head else ()), left_out
 
 

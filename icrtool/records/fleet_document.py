@@ -56,12 +56,12 @@ class FleetVerdict(Record, frozen=True, kw_only=True):
     not_checked: str
 
 
-def fleet_verdict(one: Verdict, log: str) -> FleetVerdict:
+def fleet_verdict(verdict: Verdict, log: str) -> FleetVerdict:
     """Return an acceptance limit under the keys of fleet.json, with the line about it, which names the log."""
     return FleetVerdict(
-        gate=one.text, value_m=one.value_m, margin_m=one.margin_m, passed=one.passed, line=one.line(log),
-        relative=one.relative, bound_m=one.value_bound_m, baseline_m=one.baseline_m, margin_low_m=one.margin_low_m,
-        margin_high_m=one.margin_high_m, not_checked=one.not_checked or "",
+        gate=verdict.text, value_m=verdict.value_m, margin_m=verdict.margin_m, passed=verdict.passed,
+        line=verdict.line(log), relative=verdict.relative, bound_m=verdict.value_bound_m, baseline_m=verdict.baseline_m,
+        margin_low_m=verdict.margin_low_m, margin_high_m=verdict.margin_high_m, not_checked=verdict.not_checked or "",
     )  # fmt: skip
 
 

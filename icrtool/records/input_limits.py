@@ -34,8 +34,8 @@ def bytes_in(text: str) -> int:
     ValueError
         It states no number of bytes above 0.
     """
-    found = re.fullmatch(r"\s*(\d{1,18}(?:\.\d{1,9})?)\s*([kMGT]?)B?\s*", text, re.ASCII)
-    count = int(float(found[1]) * _UNITS[found[2]]) if found is not None else 0
+    parts = re.fullmatch(r"\s*(\d{1,18}(?:\.\d{1,9})?)\s*([kMGT]?)B?\s*", text, re.ASCII)
+    count = int(float(parts[1]) * _UNITS[parts[2]]) if parts is not None else 0
     if count < 1:
         raise ValueError(f"{text!r} is no number of bytes; for example 800000, 500M or 2GB")
     return count

@@ -58,9 +58,9 @@ def about(subject: str, notes: Iterable[Note]) -> tuple[Note, ...]:
     return tuple(msgspec.structs.replace(one, subject=plain) for one in notes)
 
 
-def is_grave(one: Note) -> bool:
+def is_grave(note: Note) -> bool:
     """Return whether the numbers must not be used after a finding."""
-    return one.grade == GRAVE
+    return note.grade == GRAVE
 
 
 def warnings_of(notes: Iterable[Note]) -> tuple[str, ...]:

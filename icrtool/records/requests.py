@@ -86,11 +86,11 @@ class ReportRequest(Record, frozen=True, kw_only=True):
 
     def configured(self, config: Config) -> ReportRequest:
         """Return the request with the horizons and outages of a configuration, where the request states none."""
-        dropout, given = config.dropout, config.given
+        dropout, keys_set = config.dropout, config.given
         return msgspec.structs.replace(
             self,
-            horizons_m=self.horizons_m or (dropout.horizons_m if "dropout.horizons_m" in given else None),
-            outage_s=self.outage_s or (dropout.forced_outage_s if "dropout.forced_outage_s" in given else None),
+            horizons_m=self.horizons_m or (dropout.horizons_m if "dropout.horizons_m" in keys_set else None),
+            outage_s=self.outage_s or (dropout.forced_outage_s if "dropout.forced_outage_s" in keys_set else None),
         )
 
 

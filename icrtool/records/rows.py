@@ -175,21 +175,21 @@ def row_of(name: str) -> Row:
 def rows_of(names: Iterable[str]) -> dict[str, Row]:
     """Return rows by name in the order in which they are shown; rows of one kind have looks in turn."""
     places = {kind: place for place, kind in enumerate(REPORT_ROWS)}
-    given = list(dict.fromkeys(names))
-    bases = list(dict.fromkeys(map(base_of, given)))
+    unique_names = list(dict.fromkeys(names))
+    bases = list(dict.fromkeys(map(base_of, unique_names)))
 
     def place(name: str) -> tuple[int, int, str]:
         return places.get(kind_of(name), len(places)), bases.index(base_of(name)), turned_by(name)
 
     looks: dict[str, tuple[Color, Dash]] = {}
-    found: dict[str, Row] = {}
-    for name in sorted(given, key=place):
+    rows: dict[str, Row] = {}
+    for name in sorted(unique_names, key=place):
         row, base = row_of(name), base_of(name)
         if base not in REPORT_ROWS:
             color, dash = looks.setdefault(base, FURTHER_LOOKS[len(looks) % len(FURTHER_LOOKS)])
             row = replace(row, color=color, dash=dash)
-        found[name] = row
-    return found
+        rows[name] = row
+    return rows
 
 
 def in_order(names: Iterable[str]) -> list[str]:

@@ -358,17 +358,17 @@ def _unrecovered(table: States, in_gap: Bools) -> Bools:
 
     Until the first fix and the first heading after a gap a state is as uncertain as the motion in the gap.
     """
-    found = np.zeros(len(table), np.bool_)
+    uncertain = np.zeros(len(table), np.bool_)
     if not in_gap.any():
-        return found
+        return uncertain
     poor = np.zeros(len(table), np.bool_)
     for std in (np.hypot(table.std_north_m, table.std_east_m), table.std_heading_rad):
         poor |= std > RECOVERED_RATIO * float(np.median(std))
     good = np.flatnonzero(~poor)
     for begin in np.flatnonzero(in_gap).tolist():
         row = int(np.searchsorted(good, begin + 1))
-        found[begin + 1 : good[row] if row < len(good) else len(found)] = True
-    return found
+        uncertain[begin + 1 : good[row] if row < len(good) else len(uncertain)] = True
+    return uncertain
 
 
 def track_of_states(

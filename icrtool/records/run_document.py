@@ -39,7 +39,7 @@ Three = msgspec.Meta(min_length=3, max_length=3)
 Matrix = Annotated[list[Annotated[list[float], Three]], Three]
 
 
-def check_together(one: object, *names: str) -> None:
+def check_together(record: object, *names: str) -> None:
     """Refuse a record of which only some of the named numbers are known.
 
     Raises
@@ -47,14 +47,14 @@ def check_together(one: object, *names: str) -> None:
     ValueError
         It is one.
     """
-    if len({getattr(one, name) is None for name in names}) > 1:
+    if len({getattr(record, name) is None for name in names}) > 1:
         raise ValueError(f"only some of {', '.join(names)} are known")
 
 
 def known_content(content: Iterable[str | None]) -> tuple[str, ...]:
     """Return the SHA-256 of the files of a log; none where one is not known."""
-    found = tuple(content)
-    return () if None in found else tuple(map(str, found))
+    digests = tuple(content)
+    return () if None in digests else tuple(map(str, digests))
 
 
 class ByIcr(Record, Generic[Value], frozen=True):

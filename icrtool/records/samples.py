@@ -280,11 +280,11 @@ class InputFile:
         """Equal for files of equal content: SHA-256, else size and version, else size and address."""
         if self.sha256 is not None:
             return (self.sha256,)
-        stated = self.version if self.version is not msgspec.UNSET else self.etag
+        version = self.version if self.version is not msgspec.UNSET else self.etag
         # a time of modification is no version: many files may have it
-        is_version = isinstance(stated, str) and bool(stated) and not stated.endswith(" GMT")
+        is_version = isinstance(version, str) and bool(version) and not version.endswith(" GMT")
         where = self.path if self.address is msgspec.UNSET else self.address
-        return (self.bytes, stated) if is_version else (self.bytes, where)
+        return (self.bytes, version) if is_version else (self.bytes, where)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Stages of the work on one log: the callback that is told when each begins."""
+"""Stages of the work on one log: the function that is called when each begins."""
 
 from __future__ import annotations
 

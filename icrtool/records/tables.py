@@ -207,9 +207,9 @@ def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str,
             return columns
     half = [column for columns in options for column in columns if column in frame]
     names = list(frame.attrs.get("names", frame))[:12]
-    found = f"only {half[0]} of a pair" if half else f"the columns are {', '.join(map(str, names))}"
+    problem = f"only {half[0]} of a pair" if half else f"the columns are {', '.join(map(str, names))}"
     wanted = " or ".join(" and ".join(dict.fromkeys(columns)) for columns in options)
-    raise DataError(name, f"{group}: no column {wanted}", found)
+    raise DataError(name, f"{group}: no column {wanted}", problem)
 
 
 def _numbers(frame: pd.DataFrame, column: str, name: str) -> Floats:
@@ -264,8 +264,8 @@ def _wheels(frame: pd.DataFrame, name: str) -> tuple[WheelSamples, tuple[str, ..
 
 def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | None, tuple[str, ...]]:
     columns = _chosen(frame, POSITION, "position", name)
-    stated = any(column in frame for pair in POSITION_STD for column in pair)
-    stds = _chosen(frame, POSITION_STD, "position", name) if stated else ()
+    has_std = any(column in frame for pair in POSITION_STD for column in pair)
+    stds = _chosen(frame, POSITION_STD, "position", name) if has_std else ()
     further = [column for column in dict.fromkeys((*stds, HEIGHT_COLUMN)) if column in frame]
     stamps, (first, second) = _rows(frame, columns, "position", name)
     extra = {column: _at(frame, column, columns, stamps, name) for column in further}

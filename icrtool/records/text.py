@@ -152,14 +152,14 @@ def with_interval(metres: float, low: float | None, high: float | None) -> str:
     return f"{value} m ({low_text} to {high_text})"
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, words: Iterable[str]) -> str:
     """Return ``did you mean X? `` for the known word that is most like `word`, for a message; empty where none is."""
     from difflib import get_close_matches
 
-    choices = {str(choice).lower(): str(choice) for choice in known}
-    given = word.lower()
-    near = get_close_matches(given, choices, n=1, cutoff=LEAST_LIKENESS)
-    near = near or [choice for choice in choices if len(given) >= LEAST_LETTERS and given in choice][:1]
+    choices = {str(choice).lower(): str(choice) for choice in words}
+    lowered = word.lower()
+    near = get_close_matches(lowered, choices, n=1, cutoff=LEAST_LIKENESS)
+    near = near or [choice for choice in choices if len(lowered) >= LEAST_LETTERS and lowered in choice][:1]
     return f"did you mean {choices[near[0]]}? " if near else ""
 
 

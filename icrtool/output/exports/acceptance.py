@@ -85,16 +85,16 @@ def limit_section(verdicts: Sequence[FleetVerdict]) -> Section:
     return Section(title, [Items([one.line for one in sorted(verdicts, key=lambda one: one.passed)])])
 
 
-def _suite(one: Suite, command: str) -> ET.Element:
-    name = xml_text(one.log)
+def _suite(tested: Suite, command: str) -> ET.Element:
+    name = xml_text(tested.log)
     counts = {
-        "tests": len(one.verdicts) + bool(one.error),
-        "failures": sum(not verdict.passed for verdict in one.verdicts),
-        "errors": int(bool(one.error)),
-        "skipped": sum(bool(verdict.not_checked) for verdict in one.verdicts),
+        "tests": len(tested.verdicts) + bool(tested.error),
+        "failures": sum(not verdict.passed for verdict in tested.verdicts),
+        "errors": int(bool(tested.error)),
+        "skipped": sum(bool(verdict.not_checked) for verdict in tested.verdicts),
     }
     suite = ET.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
-    for verdict in one.verdicts:
+    for verdict in tested.verdicts:
         element = ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate))
         line = xml_text(verdict.line)
         if verdict.not_checked:
@@ -103,7 +103,7 @@ def _suite(one: Suite, command: str) -> ET.Element:
             ET.SubElement(element, "failure", type="gate", message=line).text = line
         else:
             ET.SubElement(element, "system-out").text = line
-    if one.error:
+    if tested.error:
         element = ET.SubElement(suite, "testcase", classname=name, name=command)
-        ET.SubElement(element, "error", type="IcrToolError", message=xml_text(one.error))
+        ET.SubElement(element, "error", type="IcrToolError", message=xml_text(tested.error))
     return suite

@@ -165,8 +165,8 @@ def _parameters(calibration: Calibration, errors: ControllerErrors, target: Cont
             numbers.right_radius_next_std,
         ),
     ):
-        known = f"± {std:.4f} here, ± {next_std:.4f} on the next drive" if std > 0.0 else "not estimated"
-        lines.append(f"{key}: {value:.4f}  # {known}")
+        deviation = f"± {std:.4f} here, ± {next_std:.4f} on the next drive" if std > 0.0 else "not estimated"
+        lines.append(f"{key}: {value:.4f}  # {deviation}")
     lines += [
         f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
         f"pose_covariance_diagonal: {pose}",

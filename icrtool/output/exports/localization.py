@@ -67,13 +67,13 @@ def _header(calibration: Calibration, numbers: Localization) -> list[str]:
 def _filter(numbers: Localization) -> list[str]:
     """Return the parameters of ekf_node."""
     odometry = numbers.wheel_topic
-    named = "of the log" if odometry else "your wheel odometry"
+    source = "of the log" if odometry else "your wheel odometry"
     lines = [
         "ekf_filter_node:",
         "  ros__parameters:",
         "    two_d_mode: true  # the motion is estimated in the plane",
         "    world_frame: odom  # without GNSS; the filter of the map frame also takes odometry/gps",
-        f"    odom0: {_text(odometry or NO_ODOMETRY_TOPIC)}  # {named}",
+        f"    odom0: {_text(odometry or NO_ODOMETRY_TOPIC)}  # {source}",
         "    # vx, vyaw of the wheels; vy, which they state as 0, with the variance of the sideways motion",
         *_used("odom0_config", {"vx", "vy", "vyaw"}),
         "    odom0_differential: false",
@@ -96,8 +96,8 @@ def _filter(numbers: Localization) -> list[str]:
 
 def _matrix(numbers: Localization) -> list[str]:
     """Return the lines of a matrix of 15 rows, with the defaults where the drive shows nothing."""
-    known = {name: one.value for name, one in numbers.process.items()}
-    diagonal = [known.get(name, one) for name, one in zip(STATE, DEFAULT_PROCESS, strict=True)]
+    noise = {name: one.value for name, one in numbers.process.items()}
+    diagonal = [noise.get(name, one) for name, one in zip(STATE, DEFAULT_PROCESS, strict=True)]
     rows = (
         ", ".join(yaml_number(value) if column == row else "0.0" for column in range(len(STATE)))
         for row, value in enumerate(diagonal)
@@ -130,16 +130,16 @@ def _left_out(numbers: Localization) -> list[str]:
     return ["# Left out, because the drive does not show it:", *lines] if numbers.left_out else []
 
 
-def _value(key: str, one: Estimate) -> list[str]:
+def _value(key: str, estimate: Estimate) -> list[str]:
     """Return a parameter [rad] below a comment with its standard deviation and source."""
-    deviation = "" if one.std is None else f" ± {one.std:.4f} rad ({math.degrees(one.std):.1f} deg)"
-    return [*_inner(one.source), f"    {key}: {one.value:z.4f}{f'  #{deviation}' if deviation else ''}"]
+    deviation = "" if estimate.std is None else f" ± {estimate.std:.4f} rad ({math.degrees(estimate.std):.1f} deg)"
+    return [*_inner(estimate.source), f"    {key}: {estimate.value:z.4f}{f'  #{deviation}' if deviation else ''}"]
 
 
-def _estimate(one: Estimate, unit: str = "") -> str:
+def _estimate(estimate: Estimate, unit: str = "") -> str:
     """Return a number with its standard deviation, as ``0.0012 ± 0.0003 m²/s²``; ``(no σ)`` without one."""
-    deviation = f"± {one.std:.2g}" if one.std is not None else "(no σ)"
-    return f"{one.value:.4g} {deviation} {unit}".rstrip()
+    deviation = f"± {estimate.std:.2g}" if estimate.std is not None else "(no σ)"
+    return f"{estimate.value:.4g} {deviation} {unit}".rstrip()
 
 
 def _text(topic: str) -> str:

@@ -93,15 +93,15 @@ def paths_of(run: Run) -> tuple[ExportPath, ...]:
     table = run.table
     icrs_of = odometry_icrs(table, run.track_width_m)
     momentary = icrs_of.pop("icr_momentary")
-    found: list[tuple[PathName, States | OdometryPath, FrozenIcrs, float]] = [("filter", table, momentary, 0.0)]
+    parts: list[tuple[PathName, States | OdometryPath, FrozenIcrs, float]] = [("filter", table, momentary, 0.0)]
     if run.smoothed is not None:
-        found.append(("smoothed", run.smoothed, momentary, 0.0))
+        parts.append(("smoothed", run.smoothed, momentary, 0.0))
     for name, icrs in icrs_of.items():
         driven = drive_wheels(table, run.in_gap, icrs)
-        found.append((name, driven, icrs, driven.end_error_m))
+        parts.append((name, driven, icrs, driven.end_error_m))
     return tuple(
         ExportPath(name, table.stamp_ns, path.east_m, path.north_m, math.pi / 2 - path.heading_rad, icrs, end_error_m)
-        for name, path, icrs, end_error_m in found
+        for name, path, icrs, end_error_m in parts
     )
 
 

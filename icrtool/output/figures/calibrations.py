@@ -197,7 +197,7 @@ class Difference(NamedTuple):
 
 
 @styled
-def transfer(found: GroupComparison, *, ax: Axes | None = None) -> Figure | Axes:
+def transfer(comparison: GroupComparison, *, ax: Axes | None = None) -> Figure | Axes:
     """Return the 95 % errors of each group by calibration, and the differences between groups, with 95 % intervals.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
@@ -211,15 +211,15 @@ def transfer(found: GroupComparison, *, ax: Axes | None = None) -> Figure | Axes
     height_in, hspace = panels_in + FOREST_GAP_IN + 1.85, FOREST_GAP_IN / (panels_in / 2)
     layout: style.Look = {"height_in": height_in, "margins_in": (left_in, 0.25, 0.85, 1.0), "hspace": hspace}
     sheet = new_sheet(
-        _comparison_title(found), f"{names}: 95 % errors by wheels alone, with 95 % intervals", ax, **layout
+        _comparison_title(comparison), f"{names}: 95 % errors by wheels alone, with 95 % intervals", ax, **layout
     )
-    own, more = sheet.subplots(2, 1, height_ratios=heights)[:, 0]
-    _draw_forest(own, errors)
-    own.set(xlabel="Error [m]", xlim=(0.0, None))
-    own.set_title(f"95 % error after {CHOICE_HORIZON_M:g} m", loc="left", pad=5.0)
-    _draw_forest(more, rows, about_zero=True)
-    more.set_xlabel("Difference of the 95 % error [m]")
-    more.set_title("Differences: right of 0 is a larger error", loc="left", pad=5.0)
+    cost_axes, difference_axes = sheet.subplots(2, 1, height_ratios=heights)[:, 0]
+    _draw_forest(cost_axes, errors)
+    cost_axes.set(xlabel="Error [m]", xlim=(0.0, None))
+    cost_axes.set_title(f"95 % error after {CHOICE_HORIZON_M:g} m", loc="left", pad=5.0)
+    _draw_forest(difference_axes, rows, about_zero=True)
+    difference_axes.set_xlabel("Difference of the 95 % error [m]")
+    difference_axes.set_title("Differences: right of 0 is a larger error", loc="left", pad=5.0)
     sheet.legend(columnspacing=2.4)
     return sheet.finished()
 
@@ -228,13 +228,13 @@ def _group(name: str) -> str:
     return style.drawable(name, LONGEST_GROUP_NAME)
 
 
-def _comparison_title(found: GroupComparison) -> str:
+def _comparison_title(comparison: GroupComparison) -> str:
     """Return the largest difference of two groups after `CHOICE_HORIZON_M`, and whether it may be chance."""
-    at = [(pair, one) for pair in found.pairs for one in pair.errors if one.horizon_m == CHOICE_HORIZON_M]
-    known = [(pair, one.p95_m, one) for pair, one in at if one.p95_m is not None]
-    if not known:
+    at = [(pair, one) for pair in comparison.pairs for one in pair.errors if one.horizon_m == CHOICE_HORIZON_M]
+    with_cost = [(pair, one.p95_m, one) for pair, one in at if one.p95_m is not None]
+    if not with_cost:
         return f"No two groups have trials of {CHOICE_HORIZON_M:g} m to compare"
-    pair, value_m, one = max(known, key=lambda each: abs(each[1]))
+    pair, value_m, one = max(with_cost, key=lambda each: abs(each[1]))
     at_m = f"at {CHOICE_HORIZON_M:g} m"
     if one.p95_low_m is None or one.p95_high_m is None:
         return f"{_group(pair.second)}: {signed(value_m, 2)} m against {_group(pair.first)} {at_m}, no interval"
@@ -244,10 +244,10 @@ def _comparison_title(found: GroupComparison) -> str:
     return f"{_group(pair.second)}: {signed(value_m, 2)} m against {_group(pair.first)} {at_m} {interval}"
 
 
-def _errors_of_groups(found: GroupComparison) -> list[Difference]:
+def _errors_of_groups(comparison: GroupComparison) -> list[Difference]:
     """Return the errors after `CHOICE_HORIZON_M`, by group; its own calibration, which is held out, first."""
-    cells = [one for one in found.transfer if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None]
-    cells.sort(key=lambda one: (list(found.groups).index(one.tested_on), one.calibrated_on != one.tested_on))
+    cells = [one for one in comparison.transfer if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None]
+    cells.sort(key=lambda one: (list(comparison.groups).index(one.tested_on), one.calibrated_on != one.tested_on))
     rows = []
     for one in cells:
         by = "own" if one.calibrated_on == one.tested_on else f"by {_group(one.calibrated_on)}'s"
@@ -257,11 +257,11 @@ def _errors_of_groups(found: GroupComparison) -> list[Difference]:
     return rows
 
 
-def _differences(found: GroupComparison) -> list[Difference]:
+def _differences(comparison: GroupComparison) -> list[Difference]:
     """Return differences between groups with their own calibrations, then the costs of foreign calibrations."""
     rows: list[tuple[ErrorsAt, str]] = [
         (one, f"{_group(pair.second)} − {_group(pair.first)}, {one.horizon_m:g} m")
-        for pair in found.pairs for one in pair.errors
+        for pair in comparison.pairs for one in pair.errors
     ]  # fmt: skip
     rows += [
         (one, f"{_group(one.tested_on)}, by {_group(one.calibrated_on)}'s − own, {one.horizon_m:g} m")
@@ -339,8 +339,8 @@ def fleet_icrs(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
     points = fleet.points
     spans = []
     for side in ("right", "left"):
-        found = [point.icr[f"y_icr_{side}_m"] or 0.0 for point in points]
-        spans.append(f"y {side} {signed(min(found), 2)} to {signed(max(found), 2)} m")
+        icrs_m = [point.icr[f"y_icr_{side}_m"] or 0.0 for point in points]
+        spans.append(f"y {side} {signed(min(icrs_m), 2)} to {signed(max(icrs_m), 2)} m")
     title, subtitle = f"ICRs: {', '.join(spans)}", f"{fleet.title}: of each log, ±1σ"
     if len(points) > MOST_CALENDAR_ROWS:
         sheet = new_sheet(title, subtitle, ax, height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12)
@@ -379,11 +379,11 @@ def _draw_over_dates(sheet: Sheet, points: Sequence[FleetLog]) -> None:
     icrs = {side: [point.icr[f"y_icr_{side}_m"] or 0.0 for point in points] for side in ("right", "left")}
     panels = sheet.subplots(2, 1, sharex=True)[:, 0]
     days = date2num([np.datetime64(point.start_utc.rstrip("Z")) for point in points])  # type: ignore[no-untyped-call]
-    for axes, (side, found) in zip(panels, icrs.items(), strict=True):
+    for axes, (side, icrs_of_side) in zip(panels, icrs.items(), strict=True):
         stds = [point.icr.get(f"std_y_icr_{side}_m") or 0.0 for point in points]
         for robot, look in zip(robots, cycle(GROUP_LOOKS), strict=False):
             mine = [point.robot == robot for point in points]
-            columns = (list(compress(column, mine)) for column in (days, found, stds))
+            columns = (list(compress(column, mine)) for column in (days, icrs_of_side, stds))
             axes.errorbar(*columns, markersize=4.5, capsize=2.0, linewidth=1.0, label=_key_of(robot), **look)
         axes.set_ylabel(f"ICR y {side} [m]")
     first, last = panels[-1].get_xlim()
@@ -409,10 +409,10 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
         for log, error in sorted(logs.items(), key=lambda one: -one[1])
     ]
     largest = sorted(errors, key=lambda one: -one[2])[:MOST_CALENDAR_ROWS]
-    shown = [one for one in errors if one in largest]
+    robots = [one for one in errors if one in largest]
     cut = f", the {MOST_CALENDAR_ROWS} largest" if len(errors) > MOST_CALENDAR_ROWS else ""
     median = error_text(float(np.median([error for *_, error in errors])))
-    labels = [_dated(log, fleet.starts_utc.get(log, "")) for _, log, _ in shown]
+    labels = [_dated(log, fleet.starts_utc.get(log, "")) for _, log, _ in robots]
     title = f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}"
     known = ", with its 95 % interval" if fleet.intervals_m else ""
     subtitle = f"{fleet.title}: 95 % error after 10 m without GNSS{known}, {fleet.model}{cut}"
@@ -422,7 +422,7 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
     axes.set_yticks(range(len(labels)), labels, parse_math=False)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     for (group, logs), look in zip(fleet.errors_m.items(), cycle(GROUP_LOOKS), strict=False):
-        rows = [row for row, one in enumerate(shown) if one[0] == group]
+        rows = [row for row, one in enumerate(robots) if one[0] == group]
         middle = error_text(float(np.median(list(logs.values()))))
         label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
         axes.plot([shown[row][2] for row in rows], rows, markersize=5.5, label=label, zorder=3, **look)

@@ -82,8 +82,8 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     first, horizons_m = models[0], report.horizons_m
     budgets_m = list(dict.fromkeys(one.budget_m for one in report.document.budgets))
     reached = [one for one in report.document.budgets if one.model in {model.name for model in models}]
-    pens, known = _pens(report), [row for row in first.document.by_horizon if row.p95_m is not None]
-    ends = [known[row] for row in ((0, -1) if len(known) > 1 else (0,) if known else ())]
+    pens, rows = _pens(report), [row for row in first.document.by_horizon if row.p95_m is not None]
+    ends = [rows[row] for row in ((0, -1) if len(rows) > 1 else (0,) if rows else ())]
     trials = ", ".join(f"{row.trials:,} trials of {row.horizon_m:g} m" for row in ends)
     # Both errors and bands of the first model, the other models and their bars, budget, outages.
     keys_in = style.KEY_ROW_IN * max(-(-(len(models) + 6) // SUMMARY_KEY_COLUMNS) - 2, 0)
@@ -142,15 +142,15 @@ def _summary_title(report: DropoutReport, first: ModelResult) -> str:
         # One question, two answers: where the next drive has the same, one is enough.
         after = f"; next drive {best.next_text}" if best.next_text and best.next_text != best.short_text else ""
         answer = f"within {best.budget_m:g} m (95 %) for {best.short_text}{after}"
-        named = f"{first.name}: {answer}"
+        headline = f"{first.name}: {answer}"
         # The subtitle names the row, too.
-        return named if len(named) <= TITLE_CHARACTERS else f"W{answer[1:]}"
-    known = [row for row in first.document.by_horizon if row.p95_m is not None]
-    if not known:
+        return headline if len(headline) <= TITLE_CHARACTERS else f"W{answer[1:]}"
+    rows = [row for row in first.document.by_horizon if row.p95_m is not None]
+    if not rows:
         return "Error over distance: no trial was long enough"
     # For a run that is not usable no distance is stated.
     refused = "" if report.usable else "Do not use: "
-    return f"{refused}{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
+    return f"{refused}{error_text(rows[-1].p95_m)} off (95 %) after {rows[-1].horizon_m:g} m"
 
 
 def _write_end(axes: Axes, report: DropoutReport, first: ModelResult) -> None:
@@ -166,12 +166,12 @@ def _write_end(axes: Axes, report: DropoutReport, first: ModelResult) -> None:
         why = report.document.trials[last + 1].why_none or "none of this row"
         texts.append((last, f"no trials beyond {horizons_m[last]:g} m: {why.partition(' (')[0]}"))
     for row, text in texts:
-        at, left = float(horizons_m[row]), float(horizons_m[row]) > 0.5 * float(horizons_m[-1])
+        at, label_left = float(horizons_m[row]), float(horizons_m[row]) > 0.5 * float(horizons_m[-1])
         axes.axvline(at, **END_LINE)
         wrapped = textwrap.fill(UNIT_SPACE.sub("\\1\N{NO-BREAK SPACE}m", text), END_CHARACTERS)
-        look: style.Look = {"ha": "right" if left else "left", "va": "bottom", "fontsize": 8.0, "color": "0.25"}
+        look: style.Look = {"ha": "right" if label_left else "left", "va": "bottom", "fontsize": 8.0, "color": "0.25"}
         axes.annotate(
-            wrapped, (at, 0.0), (-4.0 if left else 4.0, 5.0), textcoords="offset points", zorder=6,
+            wrapped, (at, 0.0), (-4.0 if label_left else 4.0, 5.0), textcoords="offset points", zorder=6,
             xycoords=axes.get_xaxis_transform(), **look,
         )  # fmt: skip
 
@@ -244,10 +244,10 @@ def _pictured(report: DropoutReport) -> list[ModelResult]:
 
 def _models(report: DropoutReport) -> list[ModelResult]:
     """Return the rows that pictures of distance show, the best row first, without the rows for comparison."""
-    shown = shown_rows([one.name for one in report.results])
-    found = [one for one in _pictured(report) if one.name in shown and not row_of(one.name).compared]
+    shown_names = shown_rows([one.name for one in report.results])
+    pictured = [one for one in _pictured(report) if one.name in shown_names and not row_of(one.name).compared]
     best = report.document.best.model if report.document.best is not None else ""
-    return sorted(found, key=lambda one: one.name != best) or list(report.results[:1])
+    return sorted(pictured, key=lambda one: one.name != best) or list(report.results[:1])
 
 
 def _pens(report: DropoutReport) -> dict[str, style.Look]:
@@ -269,9 +269,9 @@ def _draw_model(
     Lines are straight between horizons, and pass the places (distance, budget) where the model reaches a budget.
     """
     p95 = result.column("p95_m")
-    known = np.isfinite(p95)
-    x = np.append(horizons_m[known], [distance_m for distance_m, _ in crossings])
-    y = np.append(p95[known], [budget_m for _, budget_m in crossings])
+    drawn = np.isfinite(p95)
+    x = np.append(horizons_m[drawn], [distance_m for distance_m, _ in crossings])
+    y = np.append(p95[drawn], [budget_m for _, budget_m in crossings])
     order = np.argsort(x, kind="stable")
     look = pen | {"zorder": 2.6 if first else 2.4}
     axes.plot(x[order], y[order], label=f"{result.name}, 95 %", **look)
@@ -293,10 +293,10 @@ def _draw_bars(
     """Draw the interval of a model's 95 % error as bars near the distances of `BAR_HORIZONS_M`; return them (x, y)."""
     rows = np.flatnonzero(np.isin(horizons_m, BAR_HORIZONS_M))
     p95, low, high = (result.column(name)[rows] for name in ("p95_m", "p95_low_m", "p95_high_m"))
-    known = np.isfinite(p95 + low + high)
-    x, reach = horizons_m[rows][known] + shift_m, np.array([p95 - low, high - p95])[:, known]
-    axes.errorbar(x, p95[known], reach, **BAR_LOOK | {"color": pen["color"]})
-    return [(np.full(2, at), np.array(ends)) for at, *ends in zip(x, low[known], high[known], strict=True)]
+    drawn = np.isfinite(p95 + low + high)
+    x, reach = horizons_m[rows][drawn] + shift_m, np.array([p95 - low, high - p95])[:, drawn]
+    axes.errorbar(x, p95[drawn], reach, **BAR_LOOK | {"color": pen["color"]})
+    return [(np.full(2, at), np.array(ends)) for at, *ends in zip(x, low[drawn], high[drawn], strict=True)]
 
 
 def _mark_reaches(

@@ -295,26 +295,26 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
     np.fmax.at(largest, inside, errors.error_m)
     error_m = np.where(np.isfinite(largest[:-1]), largest[:-1], error_m)
     # The largest errors lie on top.
-    shown = np.flatnonzero(np.isfinite(error_m))
-    shown = shown[np.argsort(error_m[shown], kind="stable")]
+    drawn = np.flatnonzero(np.isfinite(error_m))
+    drawn = drawn[np.argsort(error_m[drawn], kind="stable")]
     place = np.column_stack([east[rows], north[rows]])
     end = min(most, MOST_OF_P95 * p95) or 1.0
     step = float(min(round_steps(end / ERROR_STEPS), key=lambda one: abs(one - end / ERROR_STEPS)))
     steps = step * np.arange(np.ceil(end / step) + 1)
     shades = ListedColormap(colormaps[ERROR_MAP](np.linspace(LIGHTEST, 1.0, len(steps) - 1)))
     lines = LineCollection(
-        np.stack([place[shown], place[shown + 1]], axis=1).tolist(), cmap=shades, linewidths=ERROR_LINE_PT,
+        np.stack([place[drawn], place[drawn + 1]], axis=1).tolist(), cmap=shades, linewidths=ERROR_LINE_PT,
         norm=BoundaryNorm(steps, len(steps) - 1), capstyle="round", zorder=3,
     )  # fmt: skip
-    lines.set_array(error_m[shown])
+    lines.set_array(error_m[drawn])
     axes.add_collection(lines, autolim=False)
     beyond = "max" if most > steps[-1] else "neither"
     bar = axes.figure.colorbar(lines, cax=axes.inset_axes((1.03, 0.0, 0.03, 1.0)), extend=beyond)
     bar.set_label(f"Error after {after} from there [m]")
     bar.outline.set_visible(False)
     bar.ax.axhline(p95, color=style.BUDGET["color"], linewidth=1.6)
-    left: style.Look = {"ha": "right", "va": "center", "fontsize": 8.0, "color": style.BUDGET["color"]}
-    style.write_near(bar.ax, "95 %", (0.0, p95), (-3.0, 0.0), xycoords=bar.ax.get_yaxis_transform(), **left)
+    label_look: style.Look = {"ha": "right", "va": "center", "fontsize": 8.0, "color": style.BUDGET["color"]}
+    style.write_near(bar.ax, "95 %", (0.0, p95), (-3.0, 0.0), xycoords=bar.ax.get_yaxis_transform(), **label_look)
     worst = [(trial.document.east_m, trial.document.north_m) for trial in report.worst[:MARKED_WORST]]
     if worst:
         label = f"the worst {len(worst)} that do not overlap" if len(worst) > 1 else "the worst"

@@ -94,12 +94,12 @@ def icr_estimates(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
         row[0].set_ylabel(f"ICR {ICR_WORDS[column]} [m]")
         settling, final = run.convergence_s[column], finals[column]
         without = "known from the start" if run.began_with is not None else "does not converge"
-        found = f"10–90 % in {settling[1] - settling[0]:.1f} s" if settling else without
-        row[0].set_title(found, loc="left", pad=4.0)
-        found = f"final {signed(final)} ± {stds[column]:.3f} m" if final is not None else "not shown by this drive"
+        numbers = f"10–90 % in {settling[1] - settling[0]:.1f} s" if settling else without
+        row[0].set_title(numbers, loc="left", pad=4.0)
+        numbers = f"final {signed(final)} ± {stds[column]:.3f} m" if final is not None else "not shown by this drive"
         if final is not None and (of_drive := run.document.icr_of_drive(column)) is not None:
-            found += f", drive {signed(of_drive[0])} ± {of_drive[1]:.3f} m"
-        row[-1].set_title(found, loc="right", pad=4.0)
+            numbers += f", drive {signed(of_drive[0])} ± {of_drive[1]:.3f} m"
+        row[-1].set_title(numbers, loc="right", pad=4.0)
     for axes, (begin, end) in zip(panels[-1], spans, strict=True):
         axes.set_xlabel(_time_axis(end - begin)[0])
     sheet.legend(ncols=4, columnspacing=1.4, handlelength=2.0)
@@ -142,11 +142,13 @@ def _draw_estimate(
     table, unit = run.table, _time_axis(span_s[1] - span_s[0])[1]
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
     t, value, std = table.t_s[rows], getattr(table, column)[rows], icr_std_m(run, column)[rows]
-    shown = extremes(value)
-    axes.plot(t[shown] / unit, value[shown], color="black", linewidth=1.0, label="estimate")
+    drawn_rows = extremes(value)
+    axes.plot(t[drawn_rows] / unit, value[drawn_rows], color="black", linewidth=1.0, label="estimate")
     low, high = value - std, value + std
-    shown = extremes(low, high)
-    axes.fill_between(t[shown] / unit, low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="its ±1σ")
+    drawn_rows = extremes(low, high)
+    axes.fill_between(
+        t[drawn_rows] / unit, low[drawn_rows], high[drawn_rows], color=style.BAND_COLOR, linewidth=0, label="its ±1σ"
+    )
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
         # At the start the band is as wide as the spread of robots: it is shown to one standard deviation.

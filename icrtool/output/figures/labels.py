@@ -71,26 +71,26 @@ def write_labels(
     crossed = np.concatenate([np.empty((0, 2)), *(_along(path, step) for path in drawn)])
     spots = axes.transData.transform(np.array([*((one.x, one.y) for one in labels), *marks], np.float64).reshape(-1, 2))
     half, written = MARK_PT * point_px, []
-    taken = np.concatenate([spots - half, spots + half], axis=1)
+    occupied = np.concatenate([spots - half, spots + half], axis=1)
     for one, spot in zip(labels, spots, strict=False):
         width, height = (size_pt / SIZE_PT * point_px * part for part in (CHARACTER_PT * len(one.text), LINE_PT))
-        second, found = None, None
+        second, free = None, None
         for dx, dy in (offset for offset in OFFSETS_PT if math.hypot(*offset) <= farthest_pt):
             x, y = spot + point_px * np.array([dx, dy]) - (width if dx <= 0 else 0.0, height / 2)
             box = np.array([x, y, x + width, y + height])
             inside = frame.x0 < box[0] and frame.y0 < box[1] and box[2] < frame.x1 and box[3] < frame.y1
-            if not inside or _overlaps(box, taken).any():
+            if not inside or _overlaps(box, occupied).any():
                 continue
             if not _overlaps(box, np.tile(crossed, 2)).any():
-                found = dx, dy, box
+                free = dx, dy, box
                 break
             second = second or (dx, dy, box)
-        found = found or (second if crossing else None)
-        if found is None:
+        free = free or (second if crossing else None)
+        if free is None:
             continue
-        dx, dy, box = found
+        dx, dy, box = free
         written.append(one)
-        taken = np.concatenate([taken, box[None]])
+        occupied = np.concatenate([occupied, box[None]])
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(dx, dy) > LINE_FROM_PT else None
         near: style.Look = {"ha": "left" if dx > 0 else "right", "va": "center", "fontsize": size_pt, "zorder": 6}
         near["color"] = one.color
@@ -113,5 +113,7 @@ def _along(path: Floats, step: float) -> Floats:
 
 def _overlaps(box: Floats, others: Floats) -> Bools:
     """Return which of other boxes (n, 4), each left, low, right, high, a box (4,) overlaps."""
-    found: Bools = (others[:, 0] < box[2]) & (others[:, 2] > box[0]) & (others[:, 1] < box[3]) & (others[:, 3] > box[1])
-    return found
+    overlapping: Bools = (
+        (others[:, 0] < box[2]) & (others[:, 2] > box[0]) & (others[:, 1] < box[3]) & (others[:, 3] > box[1])
+    )
+    return overlapping

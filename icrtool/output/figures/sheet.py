@@ -98,46 +98,46 @@ class Sheet:
             for ratios, count in ((width_ratios, columns), (height_ratios, rows))
         )
         if self.ax is None:
-            made = self.figure.subplots(
+            panels = self.figure.subplots(
                 rows, columns, squeeze=False, sharex=sharex, sharey=sharey,
                 gridspec_kw={"width_ratios": widths.tolist(), "height_ratios": heights.tolist()},
             )  # fmt: skip
         elif (rows, columns) == (1, 1):
-            made = np.array([[self.ax]], object)
+            panels = np.array([[self.ax]], object)
         else:
-            made = self._inside(heights, widths, sharex=bool(sharex), sharey=bool(sharey))
-        self.panels.extend(made.ravel())
-        return made
+            panels = self._inside(heights, widths, sharex=bool(sharex), sharey=bool(sharey))
+        self.panels.extend(panels.ravel())
+        return panels
 
     def _inside(self, heights: Floats, widths: Floats, *, sharex: bool, sharey: bool) -> Grid:
         """Return panels within the place of the caller's axes, which then show their title alone."""
         ax = cast("Axes", self.ax)
         ax.set_axis_off()
         (left, width), (top, height) = _places(widths), _places(heights)
-        made = np.empty((len(heights), len(widths)), object)
-        for row, column in np.ndindex(*made.shape):
-            shared = {"sharex": made[0, column]} if sharex and row else {}
-            shared |= {"sharey": made[row, 0]} if sharey and column else {}
+        panels = np.empty((len(heights), len(widths)), object)
+        for row, column in np.ndindex(*panels.shape):
+            shared = {"sharex": panels[0, column]} if sharex and row else {}
+            shared |= {"sharey": panels[row, 0]} if sharey and column else {}
             place = left[column], 1.0 - top[row] - height[row], width[column], height[row]
-            panel = made[row, column] = ax.inset_axes(place, **shared)
+            panel = panels[row, column] = ax.inset_axes(place, **shared)
             if sharex and row + 1 < len(heights):
                 panel.tick_params(labelbottom=False)
-        return made
+        return panels
 
     def legend(self, **layout: Any) -> None:
         """Add a legend with each label once: below all axes, or within the caller's axes."""
-        found: dict[str, Artist] = {}
+        entries: dict[str, Artist] = {}
         for axes in self.panels:
             for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-                found.setdefault(str(label), handle)
-        if not found:
+                entries.setdefault(str(label), handle)
+        if not entries:
             return
         if self.ax is None:
-            legend = self.figure.legend(found.values(), found.keys(), **{"ncols": len(found)} | layout)
+            legend = self.figure.legend(entries.values(), entries.keys(), **{"ncols": len(entries)} | layout)
         elif self.panels == [self.ax]:
-            legend = self.ax.legend(list(found.values()), list(found), loc="best", fontsize="small")
+            legend = self.ax.legend(list(entries.values()), list(entries), loc="best", fontsize="small")
         else:
-            legend = self.ax.legend(list(found.values()), list(found), **INSIDE_KEY)
+            legend = self.ax.legend(list(entries.values()), list(entries), **INSIDE_KEY)
         for text in legend.get_texts():
             text.set_parse_math(False)
 
@@ -147,10 +147,10 @@ class Sheet:
             self._fit_to_dark(self.ax)
             return self.ax
         below = ScaledTranslation(0.0, -LABEL_BELOW_IN, self.figure.dpi_scale_trans)
-        left = ScaledTranslation(-LABEL_LEFT_IN, 0.0, self.figure.dpi_scale_trans)
+        to_the_left = ScaledTranslation(-LABEL_LEFT_IN, 0.0, self.figure.dpi_scale_trans)
         for axes in self.panels:
             axes.xaxis.set_label_coords(0.5, 0.0, axes.transAxes + below)
-            axes.yaxis.set_label_coords(0.0, 0.5, axes.transAxes + left)
+            axes.yaxis.set_label_coords(0.0, 0.5, axes.transAxes + to_the_left)
         return self.figure
 
     def _fit_to_dark(self, ax: Axes) -> None:
@@ -180,8 +180,8 @@ class Sheet:
                     continue
                 of_line = ("color", "markerfacecolor", "markeredgecolor")
                 names = of_line if isinstance(artist, Line2D) else ("facecolor", "edgecolor")
-                found = {name: getattr(artist, f"get_{name}")() for name in names}
-                artist.set(**{name: fitted(one) for name, one in found.items() if len(to_rgba_array(one))})
+                properties = {name: getattr(artist, f"get_{name}")() for name in names}
+                artist.set(**{name: fitted(one) for name, one in properties.items() if len(to_rgba_array(one))})
             for text in panel.texts:
                 # light words have the caller's colour already
                 if text not in self.of_caller and np.mean(to_rgb(text.get_color())) < MID_GREY:
@@ -190,8 +190,8 @@ class Sheet:
 
 def _background(ax: Axes) -> ColorType:
     """Return the colour behind axes: the colour of their figure where they are transparent."""
-    own = ax.get_facecolor()
-    return own if to_rgba(own)[3] > 0.0 else cast("Figure", ax.get_figure(root=True)).get_facecolor()
+    color = ax.get_facecolor()
+    return color if to_rgba(color)[3] > 0.0 else cast("Figure", ax.get_figure(root=True)).get_facecolor()
 
 
 def _places(sizes: Floats) -> tuple[list[float], list[float]]:

@@ -113,8 +113,8 @@ def over(
     """
     values = [level.setting.value for level in levels]
     for place, (column, look) in enumerate(columns.items()):
-        found = [level.metrics()[column] for level in levels]
-        _points(axes, values, [(one["p5"], one["p50"], one["p95"]) for one in found], look, 0.15 * (place - 1))
+        numbers = [level.metrics()[column] for level in levels]
+        _points(axes, values, [(one["p5"], one["p50"], one["p95"]) for one in numbers], look, 0.15 * (place - 1))
     axes.set_xlabel(_varied(result))
     if "x" in log:
         axes.set_xscale("log")
@@ -125,13 +125,13 @@ def over(
         axes.set_yscale("log")
 
 
-def _points(axes: Axes, values: Sequence[Any], found: Sequence[Any], look: style.Look, shift: float) -> None:
+def _points(axes: Axes, values: Sequence[Any], numbers: Sequence[Any], look: style.Look, shift: float) -> None:
     """Draw (low, middle, high) over numbers, or over names at equal steps."""
     x: Any = values
     if isinstance(values[0], str):
         axes.set_xticks(range(len(values)), [str(value).replace("_", " ") for value in values])
         x, look = np.arange(len(values)) + shift, look | {"linestyle": "none"}
-    low, middle, high = np.array(found).T
+    low, middle, high = np.array(numbers).T
     axes.errorbar(x, middle, [middle - low, high - middle], elinewidth=0.8, capsize=2.0, **WIDE | look)
 
 

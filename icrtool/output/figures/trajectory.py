@@ -146,15 +146,17 @@ def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Fl
         for value, look in FIX_LOOKS.items()
     ]
     place = np.column_stack([fixes.north_m, fixes.east_m])
-    seen = ((place >= lowest) & (place <= highest)).all(axis=1)
+    in_view = ((place >= lowest) & (place <= highest)).all(axis=1)
     rejected = gnss.rejected, REJECTED_LOOK, f"{word}, {np.count_nonzero(gnss.rejected):,} rejected"
     for chosen, look, label in (*groups, rejected):
         if chosen.any():
-            north, east = place[chosen & seen].T
-            shown = places(north, east, cell_m if look is not REJECTED_LOOK else cell_m * CELLS_A_VIEW / REJECTED_CELLS)
+            north, east = place[chosen & in_view].T
+            drawn_rows = places(
+                north, east, cell_m if look is not REJECTED_LOOK else cell_m * CELLS_A_VIEW / REJECTED_CELLS
+            )
             if look is REJECTED_LOOK:
-                shown = shown[:: 1 + len(shown) // MOST_REJECTED]
-            axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, label=label, **look)
+                drawn_rows = drawn_rows[:: 1 + len(drawn_rows) // MOST_REJECTED]
+            axes.plot(east[drawn_rows], north[drawn_rows], linestyle="none", zorder=1.5, label=label, **look)
 
 
 def _draw_jumps(axes: Axes, run: Run) -> None:
@@ -249,5 +251,5 @@ def name_directions(axes: Axes, document: RunDocument | None = None) -> None:
 
 def draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: style.Look, **look: Any) -> None:
     """Draw a path (n,), a point for each cell it enters."""
-    shown = places(north_m, east_m, cell_m)
-    axes.plot(east_m[shown], north_m[shown], **pen, **look)
+    rows = places(north_m, east_m, cell_m)
+    axes.plot(east_m[rows], north_m[rows], **pen, **look)

@@ -280,7 +280,7 @@ def partial_at(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
 
     Hidden files that killed processes left there are removed too.
     """
-    for left in list(place.parent.glob(_hidden_name(place, "*-*-*"))):
+    for abandoned in list(place.parent.glob(_hidden_name(place, "*-*-*"))):
         # An old directory under a hidden name is kept as long as nothing is in its place.
         with suppress(FileNotFoundError):
             if _is_left(left) and (left.suffix == PARTIAL_SUFFIX or place.exists()):

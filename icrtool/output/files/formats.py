@@ -126,10 +126,10 @@ def read_numbers(
             if most_bytes is not None and path.stat().st_size > most_bytes:
                 raise DataError(path, f"larger than {most_bytes / 1e6:g} MB", "leave out some of its rows")
             reader = csv.DictReader(file, skipinitialspace=True)
-            found = tuple(reader.fieldnames or ())
-            if missing := [name for name in needed if name not in found]:
-                raise DataError(path, f"no column {missing[0]}", f"it holds {', '.join(found) or 'nothing'}")
-            names = [*needed, *(name for name in optional if name in found)]
+            header = tuple(reader.fieldnames or ())
+            if missing := [name for name in needed if name not in header]:
+                raise DataError(path, f"no column {missing[0]}", f"it holds {', '.join(header) or 'nothing'}")
+            names = [*needed, *(name for name in optional if name in header)]
             rows = [[float(row[name] or "nan") for name in names] for row in reader]
     except OSError as err:
         raise DataError(path, "cannot be read", err.strerror or str(err)) from err
@@ -299,14 +299,14 @@ def calibration_file(place: Place) -> Place:
     OutputError
         Its folder does not exist, or something that is not a calibration is there.
     """
-    found = Below(path_of(place), CALIBRATION_FILE) if path_of(place).is_dir() else place
-    file = path_of(found)
+    target = Below(path_of(place), CALIBRATION_FILE) if path_of(place).is_dir() else place
+    file = path_of(target)
     if not file.parent.is_dir():
         raise OutputError(file, f"there is no folder {file.parent}", "make it, or name another place")
-    replaced = file.is_symlink() and isinstance(found, Below)
+    replaced = file.is_symlink() and isinstance(target, Below)
     if file.exists() and not replaced and schema_of(file) != CALIBRATION_SCHEMA:
         raise OutputError(file, "a file that is not a calibration is there", "it is left alone; name another place")
-    return found
+    return target
 
 
 def read_fleet(directory: Path) -> FleetDocument:
@@ -329,9 +329,9 @@ def logs_of_fleet(directory: Path) -> list[FleetLog]:
         The folder does not hold the result of a batch.
     """
     try:
-        found = [one for one in read_fleet(directory).logs if one.status != "failed"]
-        for one in found:
+        usable = [one for one in read_fleet(directory).logs if one.status != "failed"]
+        for one in usable:
             Below(directory, one.run).check_links()
     except (OSError, ValueError, RecursionError) as err:
         raise RunError(directory, f"its {FLEET_FILE} cannot be read ({err})", "name the folder of a batch") from err
-    return found
+    return usable

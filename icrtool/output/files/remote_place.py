@@ -49,8 +49,8 @@ Needed = Callable[[str], bool]
 
 def is_document(name: str) -> bool:
     """Return whether a file describes results: it states what a folder holds and whether that may be replaced."""
-    own = name.endswith((".json", ".html", ".png")) or PurePosixPath(name).name in {SOURCES_FILE, CHECKSUM_FILE}
-    return own and not name.startswith("runs/")
+    is_ours = name.endswith((".json", ".html", ".png")) or PurePosixPath(name).name in {SOURCES_FILE, CHECKSUM_FILE}
+    return is_ours and not name.startswith("runs/")
 
 
 @contextmanager
@@ -278,10 +278,10 @@ class _Store:
         def ask() -> dict[str, Any]:
             self._files.invalidate_cache()
             try:
-                stated: dict[str, Any] = self._files.info(self._of(name))
+                facts: dict[str, Any] = self._files.info(self._of(name))
             except FileNotFoundError:
                 return {}
-            return stated
+            return facts
 
         return self._done(ask)
 
@@ -289,13 +289,13 @@ class _Store:
         """Return the files below the address."""
         self._files.invalidate_cache()
         if parts is None:
-            found = self._done(lambda: self._files.find(self._name))
+            names = self._done(lambda: self._files.find(self._name))
         else:
-            found = self._done(self._at_top)
-            found += self._done(lambda: [name for part in parts for name in self._files.find(self._of(part))])
-        if found == [self._name]:
+            names = self._done(self._at_top)
+            names += self._done(lambda: [name for part in parts for name in self._files.find(self._of(part))])
+        if names == [self._name]:
             raise OutputError(self._place, "a file is there", "name another place")
-        return [name.removeprefix(f"{self._name}/") for name in found]
+        return [name.removeprefix(f"{self._name}/") for name in names]
 
     def _at_top(self) -> list[str]:
         # `find` with a depth lists all files at az://, and ignores errors at s3://.

@@ -212,8 +212,8 @@ def _parquet_column(file: pq.ParquetFile, name: str) -> NDArray[Any]:
 
 
 def _check_columns(schema: pa.Schema, types: dict[str, pa.DataType]) -> None:
-    found = [(name, kind) for name, kind in zip(schema.names, schema.types, strict=True) if name in types]
-    if sorted(name for name, _ in found) != sorted(types) or dict(found) != types:
+    columns = [(name, kind) for name, kind in zip(schema.names, schema.types, strict=True) if name in types]
+    if sorted(name for name, _ in columns) != sorted(types) or dict(columns) != types:
         raise ValueError("its columns are not the columns of states")
 
 
@@ -266,10 +266,10 @@ def write_measurements(run: Run, path: Path) -> None:
     OSError
         The file cannot be written.
     """
-    sensors, before = run.sensors, len(run.sensors.wheels.stamp_ns) - len(run.table)
+    sensors, count_before = run.sensors, len(run.sensors.wheels.stamp_ns) - len(run.table)
     columns: dict[str, NDArray[Any]] = {}
     for name in WHEEL_COLUMNS:
-        columns[f"wheels_{name}"] = getattr(sensors.wheels, name)[:before]
+        columns[f"wheels_{name}"] = getattr(sensors.wheels, name)[:count_before]
     for group, record in (("fixes", sensors.fixes), ("headings", sensors.headings)):
         columns |= {f"{group}_{name}": getattr(record, name) for name in _names(type(record))}
     for group, outcome in (("fixes", run.gnss), ("headings", run.heading)):
@@ -311,8 +311,8 @@ def read_measurements(
                 with stored.open(member) as array:
                     read: NDArray[Any] = np.lib.format.read_array(array, allow_pickle=False)
                     columns[member.filename.removesuffix(".npy")] = read
-        before = _columns(columns, "wheels", WHEEL_COLUMNS)
-        stamps, left, right = (np.concatenate([before[name], getattr(table, name)]) for name in WHEEL_COLUMNS)
+        before_states = _columns(columns, "wheels", WHEEL_COLUMNS)
+        stamps, left, right = (np.concatenate([before_states[name], getattr(table, name)]) for name in WHEEL_COLUMNS)
         fixes = Fixes(**_columns(columns, "fixes", _names(Fixes)))
         headings = HeadingSamples(**_columns(columns, "headings", _names(HeadingSamples)))
         gyro = None
@@ -338,10 +338,10 @@ def read_measurements(
         )
         outcomes = []
         for group, stamps_ns in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns)):
-            found = [_checked(columns, f"{group}_{name}", name) for name in OUTCOME_COLUMNS]
-            if {len(column) for column in found} != {len(stamps_ns)}:
+            outcome = [_checked(columns, f"{group}_{name}", name) for name in OUTCOME_COLUMNS]
+            if {len(column) for column in outcome} != {len(stamps_ns)}:
                 raise ValueError(f"the {group} and their outcomes differ in number")
-            outcomes.append(MeasurementOutcome(stamps_ns, int(table.stamp_ns[0]), *found))
+            outcomes.append(MeasurementOutcome(stamps_ns, int(table.stamp_ns[0]), *outcome))
     except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError, SyntaxError, TokenError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
     first = len(stamps) - len(table)
@@ -360,10 +360,10 @@ def _names(record: type) -> tuple[str, ...]:
 
 def _columns(columns: dict[str, NDArray[Any]], group: str, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Return the columns of a group, all of one length and of their types."""
-    found = {name: _checked(columns, f"{group}_{name}", name) for name in names}
-    if len({len(column) for column in found.values()}) > 1:
+    by_name = {name: _checked(columns, f"{group}_{name}", name) for name in names}
+    if len({len(column) for column in by_name.values()}) > 1:
         raise ValueError(f"the columns of the {group} differ in length")
-    return found
+    return by_name
 
 
 def _checked(columns: dict[str, NDArray[Any]], key: str, name: str) -> NDArray[Any]:

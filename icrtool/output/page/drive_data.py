@@ -102,12 +102,12 @@ def errors_data(report: DropoutDocument) -> dict[str, object]:
     """Return the errors over distance by model, and the errors of the reference alone."""
     models = ordered(report.models)
     rows = rows_of(one.name for one in models)
-    shown = shown_rows(list(rows))
+    shown_names = shown_rows(list(rows))
     reference = report.reference_error
     return {
         "horizons_m": [row.horizon_m for row in models[0].by_horizon] if models else [],
         "models": [
-            {"name": one.name, "label": one.name, "shown": one.name in shown, **row_look(rows[one.name])}
+            {"name": one.name, "label": one.name, "shown": one.name in shown_names, **row_look(rows[one.name])}
             | {key: [getattr(row, column) for row in one.by_horizon] for key, column in ERROR_KEYS.items()}
             for one in models
         ],
@@ -161,12 +161,12 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
     """Return place, time and distance from the filter of the used and of the rejected fixes."""
     fixes, difference = run.sensors.fixes, run.gnss.difference
-    found: dict[str, object] = {"top_m": scale_end_m(difference[run.gnss.used])}
+    data: dict[str, object] = {"top_m": scale_end_m(difference[run.gnss.used])}
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
         rows, differences = _differences(run.gnss, chosen, difference)
         north, east = packed(fixes.north_m[rows] - origin[0]), packed(fixes.east_m[rows] - origin[1])
-        found[name] = differences | {"north": north, "east": east}
-    return found
+        data[name] = differences | {"north": north, "east": east}
+    return data
 
 
 def _differences(outcome: MeasurementOutcome, chosen: Bools, difference: Floats) -> tuple[Ints, dict[str, object]]:
@@ -210,11 +210,17 @@ def _models_data(
         }
         for name, (heading, place) in paths.items()
     }
-    known = rows_of(one.name for one in report.models)
-    driven = {name: row for name, row in known.items() if name in paths or name == "icr"}
-    shown = shown_rows(list(known))
+    report_rows = rows_of(one.name for one in report.models)
+    driven = {name: row for name, row in report_rows.items() if name in paths or name == "icr"}
+    shown_names = shown_rows(list(report_rows))
     models = [
-        {"name": name, "label": name, "shown": name in shown, "held_out": row.knows == REST_OF_DRIVE, **row_look(row)}
+        {
+            "name": name,
+            "label": name,
+            "shown": name in shown_names,
+            "held_out": row.knows == REST_OF_DRIVE,
+            **row_look(row),
+        }
         for name, row in driven.items()
     ]
     return {"models": models, "paths": packed_paths}
@@ -245,9 +251,9 @@ def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument,
         for name, fit in fits.items():
             # A drive too short to find the delay of its wheels has no path.
             with suppress(DataError):
-                own = own_constants(windows(), fit, recording.width_m)
+                constants = own_constants(windows(), fit, recording.width_m)
                 fitted = controller_model(fit, recording.lever, recording.width_m) if model == CONTROLLER else fit
-                yield name, predicted_path(recording, fitted, own)(recording.track.t[rows])
+                yield name, predicted_path(recording, fitted, constants)(recording.track.t[rows])
 
 
 def _fitted(name: str, fits: Mapping[str, FitDocument]) -> FittedModel:
@@ -264,13 +270,16 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
         turned, document = one.with_gyro, one.calibration
         if recording is not None and document and not (turned and recording.track.gyro is None):
             with suppress(DataError):
-                found = calibrated_drive(
+                tested = calibrated_drive(
                     stored_calibration(document), recording, one.name, with_gyro=turned,
                     refit_sensors=report.request.refit_sensors,
                 )  # fmt: skip
                 # one path for all starts: with the bias of the gyro as known at the end
-                known = found.drive.learned[-1]
-                yield one.name, predicted_path(recording, known.fitted, known.constants)(recording.track.t[rows])
+                last_learned = tested.drive.learned[-1]
+                yield (
+                    one.name,
+                    predicted_path(recording, last_learned.fitted, last_learned.constants)(recording.track.t[rows]),
+                )
 
 
 LARGEST_STEP = 32_000

@@ -105,12 +105,12 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     report : what report.json holds
     pictures : pictures by name; the page shows them where no script draws
     """
-    summary, stated = run.document, report
+    summary, report_document = run.document, report
     if not coordinates:
         # Without the datum, coordinates relative to it do not show the place.
         metric = summary.gnss.datum is None
         pictures = {name: one for name, one in pictures.items() if not (metric and one.with_place)}
-        summary, stated = without_place(run, report)
+        summary, report_document = without_place(run, report)
     compared = with_smoothed_reference(run) if report.request.reference == "smoothed" else run
     begun = f"{datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     place, datum = "left out", summary.gnss.datum
@@ -118,21 +118,21 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
         place = "metric reference, no datum"
         if datum is not None:
             place = f"datum {datum[0]:z.6f}° {datum[1]:z.6f}°, {datum[2]:z.1f} m"
-    made = (
+    made_with = (
         f"icrtool {summary.tool_version}, {summary.schema}, {report.schema}; {report.starts:,} states; "
         f"intervals by {report.intervals.method}"
     )
     provenance = [("log", f"{one.path}: {one.bytes:,} bytes, sha256 {one.sha256}") for one in summary.inputs]
-    made_from = Section("Provenance", [Facts([*provenance, ("place", place), ("made with", made)])], PAGE)
+    made_from = Section("Provenance", [Facts([*provenance, ("place", place), ("made with", made_with)])], PAGE)
     about = "From it icrtool learned how the robot slips, and tested how far wheel speeds alone keep the position."
-    if not with_verdict(summary, stated).usable:
+    if not with_verdict(summary, report_document).usable:
         about = "How the robot slips when it turns could not be learned from this drive."
     rows = rows_of(one.name for one in report.models)
     meanings = {name: f"{row.words}; learned from {row.knows}" for name, row in rows.items()}
     words = Section("ICR, recommended, no_slip, trial, σ …", [Facts(list((meanings | GLOSSARY).items()))], PAGE)
     blocks = [
         Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}.", about),
-        *page_blocks(summary, stated),
+        *page_blocks(summary, report_document),
         Section("Log and settings", [streams_section(summary), *_settings(summary), made_from], name="log"),
         Section("Words on this page", [words], name="words"),
     ]
@@ -264,13 +264,13 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, Dropo
     document, changed = run.document, msgspec.structs.replace
     north, east = float(run.table.north_m[0]), float(run.table.east_m[0])
     cause, datum, notes = document.heading.offset_name, document.gnss.datum, document.notes
-    stated = report.notes
+    report_notes = report.notes
     if cause:
-        notes, stated = (
+        notes, report_notes = (
             tuple(changed(one, text=one.text.replace(cause, "its cause is left out")) for one in some)
-            for some in (notes, stated)
+            for some in (notes, report_notes)
         )
-    shown = changed(
+    document_without = changed(
         document,
         config=replace(document.config, frames=replace(document.config.frames, datum=None)),
         notes=notes,
@@ -279,7 +279,7 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, Dropo
         heading=changed(document.heading, offset_name=None, magnetic_declination_deg=None, utm_convergence_deg=None),
     )
     moved = (changed(one, north_m=one.north_m - north, east_m=one.east_m - east) for one in report.worst)
-    return shown, changed(report, worst=tuple(moved), notes=stated, warnings=warnings_of(stated))
+    return document_without, changed(report, worst=tuple(moved), notes=report_notes, warnings=warnings_of(report_notes))
 
 
 def fleet_page(document: FleetDocument, folder: Path) -> str:
@@ -292,9 +292,9 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
     logs, title, counts = document.logs, folder.absolute().name, document.counts
     unusable = sum(log.status == "done" and not log.usable for log in logs)
     skipped = f" ({counts.skipped} of them before, skipped this time)" if counts.skipped else ""
-    found = [f"{counts.done - unusable} can be used", f"{unusable} cannot", f"{counts.failed} failed{skipped}"]
-    found += [f"acceptance limits not met: {document.gates_failed}"] if document.gates_failed else []
-    about = f"{len(logs)} logs: {', '.join(found)}. Made with icrtool {document.tool_version}."
+    counts_text = [f"{counts.done - unusable} can be used", f"{unusable} cannot", f"{counts.failed} failed{skipped}"]
+    counts_text += [f"acceptance limits not met: {document.gates_failed}"] if document.gates_failed else []
+    about = f"{len(logs)} logs: {', '.join(counts_text)}. Made with icrtool {document.tool_version}."
     # Reasons without details of a single log: the first part of ``why; advice``.
     reasons = Counter(log.reason.split(";")[0].split(" (tried")[0] for log in logs if log.status == "failed")
     why = Table("lr", [(reason, f"{count}") for reason, count in reasons.most_common()], ("reason", "logs"))
@@ -325,10 +325,12 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
                 Cell(distance, more=(between,) if between else ()),
             ]
         icrs = ", ".join(map(signed, one.icrs_m))
-        more = [one.group] if grouped else []
+        group_cell = [one.group] if grouped else []
         left_out = [", ".join(one.left_out)] if incomplete else []
         model = labels.get(one.recommended, one.recommended)
-        rows.append([one.robot or "all logs", *numbers, *more, f"{len(one.logs)}", icrs, model, one.file, *left_out])
+        rows.append(
+            [one.robot or "all logs", *numbers, *group_cell, f"{len(one.logs)}", icrs, model, one.file, *left_out]
+        )
     group, omitted = ("group",) if grouped else (), ("left out",) if incomplete else ()
     head = ("robot", "multiplier", "within 0.5 m (95 %)", *group, "logs", "ICRs right, left, x [m]",
             "motion model", "calibration file", *omitted)  # fmt: skip
@@ -339,7 +341,7 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
 
 def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
     """Return a table with a row a log that links to its page; a failed log has its reason in place of numbers."""
-    named = [key for key in ("robot", "group") if len({getattr(log, key) for log in logs} - {""}) > 1]
+    varied = [key for key in ("robot", "group") if len({getattr(log, key) for log in logs} - {""}) > 1]
     # Distances within a budget come from the best model that at least one log has.
     distances = dict.fromkeys(name for log in logs for name in log.errors if "_within_" in name)
     by_model = ([name for name in distances if name.startswith(f"{model}_within_")] for model in IN_CSV)
@@ -350,7 +352,7 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
     rows, search = [], []
     for log, columns in zip(logs, numbers_of, strict=True):
         status = Cell("not usable", note=log.reason) if log.status == "done" and not log.usable else log.status
-        names = [getattr(log, key) for key in named]
+        names = [getattr(log, key) for key in varied]
         page = PurePosixPath(log.run) / PAGE_FILE
         # No link to a page that does not exist or lies outside the folder.
         link = "" if page.is_absolute() or not is_regular(Below(folder, page)) else f"./{quote(str(page))}"
@@ -364,8 +366,8 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
         "the 95 % interval. Next drive: the distance that 9 of 10 further drives on this ground keep, with the row "
         "before it."
     )
-    head = ("log", "status", *named, *next(iter(numbers_of), ()))
-    return Table(f"ll{'l' * len(named)}r", rows, head, caption, search=search, folded=_folded_columns(logs))
+    head = ("log", "status", *varied, *next(iter(numbers_of), ()))
+    return Table(f"ll{'l' * len(varied)}r", rows, head, caption, search=search, folded=_folded_columns(logs))
 
 
 def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
@@ -414,8 +416,8 @@ def _folded_columns(logs: Sequence[FleetLog]) -> list[str]:
     The other columns fit on a screen of 1280 pixels.
     """
     names = {name.partition("_p95_")[0] for log in logs for name in log.errors}
-    kept = (CONTROLLER, MAIN_ROW if MAIN_ROW in names else FALLBACK_ROW, "no_slip")
-    further = [_error_column(model) for model in IN_CSV if model not in kept]
+    unfolded = (CONTROLLER, MAIN_ROW if MAIN_ROW in names else FALLBACK_ROW, "no_slip")
+    further = [_error_column(model) for model in IN_CSV if model not in unfolded]
     limits = [] if any(log.gates_failed for log in logs) else ["limits not met"]
     return [*further, *(f"ICR {word}" for word in ICR_WORDS.values()), "events", *limits]
 
@@ -429,32 +431,32 @@ def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
     return _cell(value, lambda number: plus_minus(number, std, sign=sign))
 
 
-def calibration_page(found: Calibration) -> str:
+def calibration_page(calibration: Calibration) -> str:
     """Return the page of a calibration as HTML."""
-    title = found.name or found.robot.name or "calibration"
+    title = calibration.name or calibration.robot.name or "calibration"
     return render(
         (COPY,), None, title=title, kind="Drive without GNSS: calibration of a robot",
-        blocks=calibration_file_blocks(found, title), geometry=geometry_sketch(found),
+        blocks=calibration_file_blocks(calibration, title), geometry=geometry_sketch(calibration),
     )  # fmt: skip
 
 
 COMPARISON_FAMILY = "icrtool/compare/"
 
 
-def comparison_page(found: GroupComparison, title: str) -> str:
+def comparison_page(comparison: GroupComparison, title: str) -> str:
     """Return the page of a comparison as HTML."""
     from icrtool.output.figures.calibrations import transfer
 
-    names, labels = list(found.groups), {name: model.label for name, model in MODELS.items()}
+    names, labels = list(comparison.groups), {name: model.label for name, model in MODELS.items()}
     groups = "; ".join(
         f"{name}: {counted(len(one.logs), 'log')}, {labels.get(one.model, one.model)}"
-        for name, one in found.groups.items()
+        for name, one in comparison.groups.items()
     )
     # The errors in the runs of each group over distance, by the group of the calibration.
     by_group: list[dict[str, object]] = []
     looks = rows_of(f"calibration:{name}" for name in names)
     for tested_on in names:
-        rows = {(one.calibrated_on, one.horizon_m): one for one in found.transfer if one.tested_on == tested_on}
+        rows = {(one.calibrated_on, one.horizon_m): one for one in comparison.transfer if one.tested_on == tested_on}
         horizons = sorted({horizon_m for _, horizon_m in rows})
         models = [
             {

@@ -114,12 +114,12 @@ def _environment() -> Environment:
 
 def _grouped(rows: Sequence[tuple[str, str]]) -> list[tuple[str, list[str]]]:
     """Return labelled sentences by label; a sentence without a label belongs to the label before it."""
-    found: list[tuple[str, list[str]]] = []
+    groups: list[tuple[str, list[str]]] = []
     for name, text in rows:
-        if name or not found:
-            found.append((name, []))
-        found[-1][1].append(text)
-    return found
+        if name or not groups:
+            groups.append((name, []))
+        groups[-1][1].append(text)
+    return groups
 
 
 def _static(name: str) -> str:
@@ -188,19 +188,19 @@ def _png(file: Below, sums: Mapping[str, str]) -> bytes:
         raise RunError(file.folder, f"{name} cannot be read ({err.strerror})", "remove it") from err
     if not content.startswith(SIGNATURE):
         raise RunError(file.folder, f"{name} is not a PNG picture", "remove it")
-    if sums.get(name, found := blake2b(content).hexdigest()) != found:
+    if sums.get(name, digest := blake2b(content).hexdigest()) != digest:
         raise RunError(file.folder, f"{name} was edited or cut short since the run", "remove it, or fit the log again")
     return content
 
 
-def pictures_of(found: Iterable[tuple[str, bytes]]) -> dict[str, Picture]:
+def pictures_of(files: Iterable[tuple[str, bytes]]) -> dict[str, Picture]:
     """Return pictures given as name and PNG file."""
     from icrtool.output.figure_catalogue import entry_of
 
     pictures = {}
-    for name, content in found:
-        if (known := entry_of(name)) is not None:
-            entry, metres = known
+    for name, content in files:
+        if (of_catalogue := entry_of(name)) is not None:
+            entry, metres = of_catalogue
             source = f"data:image/png;base64,{b64encode(content).decode('ascii')}"
             pictures[name] = Picture(entry.title.format(metres), entry.caption, source, entry.with_place)
     return pictures

@@ -110,11 +110,11 @@ class Geometry(NamedTuple):
     height: float = HEIGHT
 
 
-def geometry_sketch(found: Calibration) -> Geometry:
+def geometry_sketch(calibration: Calibration) -> Geometry:
     """Return the ICRs of a calibration and the tracks of its robot."""
-    y_right, y_left, x_icr = (found.geometry[name] for name in ICR_COLUMNS)
-    std_right, std_left, std_x = (found.geometry_std[name] for name in ICR_COLUMNS)
-    half = found.width_m / 2.0
+    y_right, y_left, x_icr = (calibration.geometry[name] for name in ICR_COLUMNS)
+    std_right, std_left, std_x = (calibration.geometry_std[name] for name in ICR_COLUMNS)
+    half = calibration.width_m / 2.0
     reach = max(abs(y_right) + std_right, abs(y_left) + std_left, half, 1e-3)
     up = max(abs(x_icr) + std_x, 1e-3)
     scale = min((WIDTH / 2.0 - 2.0 * MARGIN) / reach, (HEIGHT / 2.0 - 2.0 * MARGIN) / up)

@@ -97,12 +97,13 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
     parameters: list[Block] = [
         table._replace(rows=named, head=(meaning, *middle, term)),
         Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
-        *sensor_tables(found),
+        *sensor_tables(calibration),
     ]
-    unfit = [one.text for one in unfit_reasons(found)]
+    unfit = [one.text for one in unfit_reasons(calibration)]
     head = ("log", "distance", "begins", "heading offset", "poses lag")
     logs = [
-        (one.name, distance_text(one.distance_m), _date_text(one.begin_ns), *_log_constants(one)) for one in found.logs
+        (one.name, distance_text(one.distance_m), _date_text(one.begin_ns), *_log_constants(one))
+        for one in calibration.logs
     ]
     return [
         Line(f"Not fit for use: {'; '.join(unfit)}" if unfit else "", "bad"),
@@ -114,7 +115,7 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
         ),
         Section("Parameters of the motion model", parameters, name="parameters"),
         Section("Logs", [Table("lr", logs, head)], name="logs"),
-        Section("Warnings", [Items(found.warnings) if found.warnings else "None."], name="warnings"),
+        Section("Warnings", [Items(calibration.warnings) if calibration.warnings else "None."], name="warnings"),
     ]
 
 
@@ -128,8 +129,8 @@ def _log_constants(log: documents.CalibrationLog) -> tuple[str, str]:
 
 def sensor_tables(calibration: Calibration) -> list[Block]:
     """Return a table of the sensors' constants that a calibration uses in a further drive; none for an old file."""
-    known = constants_document(pooled_constants(calibration.logs, with_gyro=calibration.gyro is not None))
-    texts = [(words, constant_text(known, name)) for name, (words, *_) in CONSTANT_WORDS.items()]
+    constants = constants_document(pooled_constants(calibration.logs, with_gyro=calibration.gyro is not None))
+    texts = [(words, constant_text(constants, name)) for name, (words, *_) in CONSTANT_WORDS.items()]
     rows = [row for row in texts if row[1]]
     return [Table("lr", rows, ("sensors, in a further drive", "value ± std"))] if rows else []
 
@@ -184,9 +185,9 @@ def _held_out_table(found: Calibration) -> Table:
 
 def _left_out_table(found: Calibration) -> Table:
     """Return p95 and expected error by horizon of each log or block, predicted by a fit without it."""
-    horizons = sorted({one.horizon_m for one in found.held_out_pooled})
-    each = {(one.log, one.horizon_m): one for one in found.held_out if one.model == MAIN_ROW}
-    names = dict.fromkeys(one.log for one in found.held_out)
+    horizons = sorted({one.horizon_m for one in calibration.held_out_pooled})
+    each = {(one.log, one.horizon_m): one for one in calibration.held_out if one.model == MAIN_ROW}
+    names = dict.fromkeys(one.log for one in calibration.held_out)
     rows = [(name, *(_errors_text(each.get((name, horizon))) for horizon in horizons)) for name in names]
     caption = f"95 % / expected error [m] of {MAIN_ROW}, each log or block of distance predicted without itself"
     return Table("lr", rows, ("left out", *(f"{horizon:g} m" for horizon in horizons)), caption)
@@ -196,8 +197,8 @@ def _date_text(stamp_ns: int) -> str:
     return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC" if stamp_ns else "not known"
 
 
-def _errors_text(one: documents.PooledScore | None) -> str:
-    return "–" if one is None else f"{one.p95_m:.2f} / {one.expected_m:.2f}"
+def _errors_text(score: documents.PooledScore | None) -> str:
+    return "–" if score is None else f"{score.p95_m:.2f} / {score.expected_m:.2f}"
 
 
 def held_out_blocks(table: HeldOut) -> list[Block]:
@@ -230,11 +231,11 @@ FORMS = {"_deg": (2, "+", " °"), "_m": (3, "+", " m"), "_s": (3, "+", " s"), "s
 def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
     """Return the settings that one log proposes, and the estimates that they come from."""
     facts = calibration.drive
-    right, left = facts.turned_right_deg, facts.turned_left_deg
+    right_deg, left_deg = facts.turned_right_deg, facts.turned_left_deg
     speed = f"{plus_minus(facts.speed_mean_mps, facts.speed_std_mps, 2, '')} m/s"
     stretches = f"{calibration.independent_stretches} independent stretches"
     head = [
-        ("drive", f"{facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left"),
+        ("drive", f"{facts.distance_m:.0f} m at {speed}, turned {right_deg:.0f}° right and {left_deg:.0f}° left"),
         ("compared", f"{calibration.windows} windows of driven distance, {stretches}"),
     ]
     rows = []
@@ -308,8 +309,8 @@ def measured_to_m(calibration: Calibration) -> float:
 
 def reach(forecast: Forecast, budget_m: float) -> float:
     """Return the distance [m] up to which 95 % of the errors stay within a budget."""
-    found = within_budget(forecast.distance_m, forecast.p95_m, budget_m)
-    return math.nan if found is None else found[0]
+    reached = within_budget(forecast.distance_m, forecast.p95_m, budget_m)
+    return math.nan if reached is None else reached[0]
 
 
 def forecast_blocks(
@@ -342,17 +343,17 @@ def forecast_blocks(
     return [*blocks, *(one.sentence for one in calibration.notes)]
 
 
-def transfer_csv(found: documents.GroupComparison) -> bytes:
+def transfer_csv(comparison: documents.GroupComparison) -> bytes:
     """Return the transfer matrix as CSV: one line for each element and horizon."""
     columns = ("calibrated_on", "tested_on", "horizon_m", "trials", *documents.ErrorsAt.__struct_fields__[1:])
-    return csv_bytes(columns, ([getattr(cell, name) for name in columns] for cell in found.transfer))
+    return csv_bytes(columns, ([getattr(cell, name) for name in columns] for cell in comparison.transfer))
 
 
-def transfer_blocks(found: documents.GroupComparison) -> list[Block]:
+def transfer_blocks(comparison: documents.GroupComparison) -> list[Block]:
     """Return the output of `icrtool compare`: verdicts, the transfer matrix, differences of each pair, the logs."""
-    names = list(found.groups)
+    names = list(comparison.groups)
     cells = dict.fromkeys(product(names, names), "-")
-    for one in found.transfer:
+    for one in comparison.transfer:
         if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None and one.expected_m is not None:
             cells[one.calibrated_on, one.tested_on] = f"{one.p95_m:.2f} / {one.expected_m:.2f}"
     matrix = [(row, *(cells[row, column] for column in names)) for row in names]
@@ -368,12 +369,14 @@ def transfer_blocks(found: documents.GroupComparison) -> list[Block]:
         Table("lr", matrix, ("", *names), caption),
         "on the diagonal each trial is predicted by a fit that does not contain it",
     ]
-    logs = [f"{name}: {one.name}, {distance_text(one.distance_m)}" for name in names for one in found.groups[name].logs]
+    logs = [
+        f"{name}: {one.name}, {distance_text(one.distance_m)}" for name in names for one in comparison.groups[name].logs
+    ]
     return [
-        *(change_sentence(pair, found) for pair in found.pairs),
-        Section("Do they differ?", [Items([pair.verdict for pair in found.pairs])], name="verdict"),
+        *(change_sentence(pair, comparison) for pair in comparison.pairs),
+        Section("Do they differ?", [Items([pair.verdict for pair in comparison.pairs])], name="verdict"),
         Section("What a calibration costs elsewhere", cost, name="cost"),
-        *(_pair_section(pair, f"pair-{number}") for number, pair in enumerate(found.pairs, start=1)),
+        *(_pair_section(pair, f"pair-{number}") for number, pair in enumerate(comparison.pairs, start=1)),
         Section("Logs", [Items(logs)], PAGE, name="logs"),
     ]
 
@@ -392,13 +395,13 @@ class Change(NamedTuple):
     differs: bool | None
 
 
-def change_sentence(pair: documents.ComparedPair, found: documents.GroupComparison) -> str:
+def change_sentence(pair: documents.ComparedPair, comparison: documents.GroupComparison) -> str:
     """Return in a sentence whether the errors of two groups differ, and the smallest change that would be seen."""
-    change = change_of(pair, found)
+    change = change_of(pair, comparison)
     return f"{change.found}; {change.power}." if change.power else f"{change.found}."
 
 
-def change_of(pair: documents.ComparedPair, found: documents.GroupComparison) -> Change:
+def change_of(pair: documents.ComparedPair, comparison: documents.GroupComparison) -> Change:
     """Return whether the errors of two groups differ, and the smallest change that would be seen.
 
     Notes
@@ -406,7 +409,7 @@ def change_of(pair: documents.ComparedPair, found: documents.GroupComparison) ->
     A change is seen where its 95 % interval does not contain zero. A true change of one half width of the interval is
     seen in one of two comparisons, a change of `SEEN_HALF_WIDTHS` half widths in four of five (power of a normal test).
     """
-    drives = sum(len(found.groups[name].logs) for name in (pair.first, pair.second))
+    drives = sum(len(comparison.groups[name].logs) for name in (pair.first, pair.second))
     of_drives = f"with these {counted(drives, 'drive')}"
     measured = (one for one in pair.errors if None not in (one.p95_m, one.p95_low_m, one.p95_high_m))
     row = min(measured, key=lambda one: abs(one.horizon_m - CHOICE_HORIZON_M), default=None)
@@ -414,9 +417,9 @@ def change_of(pair: documents.ComparedPair, found: documents.GroupComparison) ->
     if row is None or row.p95_m is None or row.p95_low_m is None or row.p95_high_m is None:
         why = "the drives are too short for an interval of the difference"
         return Change(f"{names}: not known: {why}", "", None)
-    seen = SEEN_HALF_WIDTHS * (row.p95_high_m - row.p95_low_m) / 2.0
+    visible_m = SEEN_HALF_WIDTHS * (row.p95_high_m - row.p95_low_m) / 2.0
     place = f"(95 % at {row.horizon_m:g} m)"
-    power = f"{of_drives} a change below {error_text(seen)} {place} would not have been seen"
+    power = f"{of_drives} a change below {error_text(visible_m)} {place} would not have been seen"
     if row.p95_low_m <= 0.0 <= row.p95_high_m:
         return Change(f"{names}: no difference of the error found", power, differs=False)
     word = "larger" if row.p95_m > 0.0 else "smaller"
@@ -424,14 +427,14 @@ def change_of(pair: documents.ComparedPair, found: documents.GroupComparison) ->
     return Change(f"{names}: the error is {word}: {size}", power, differs=True)
 
 
-def comparison_title(found: documents.GroupComparison) -> Title:
+def comparison_title(comparison: documents.GroupComparison) -> Title:
     """Return the verdict of a comparison as the heading of its page."""
-    changes = [change_of(pair, found) for pair in found.pairs]
+    changes = [change_of(pair, comparison) for pair in comparison.pairs]
     if len(changes) == 1:
         (change,) = changes
         return Title(_capital(change.found), f"{_capital(change.power)}." if change.power else "")
     differing = sum(change.differs is True for change in changes)
-    first = next(iter(found.groups))
+    first = next(iter(comparison.groups))
     return Title(f"{differing} of {counted(len(changes), 'group')} differ from {first} in their error", "")
 
 

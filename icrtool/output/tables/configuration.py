@@ -34,8 +34,8 @@ def format_configuration(config: Config) -> str:
             ]
             mark = "#" if value == default[section][key] else ""
             note = f"{describe_key(section, key)}{'; no default, this is an example' if value is None else ''}"
-            shown = _toml(about["example"] if value is None else value)
-            parts.append(f"{mark}{key} = {shown}  # {note}\n\n")
+            value_text = _toml(about["example"] if value is None else value)
+            parts.append(f"{mark}{key} = {value_text}  # {note}\n\n")
         parts[-1] = parts[-1].removesuffix("\n")
     return "".join(parts)
 

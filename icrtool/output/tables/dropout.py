@@ -149,12 +149,12 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
     return rows, [reach_row(by_model[name]) for name in order if name not in first]
 
 
-def reach_row(one: BudgetDistance, note: str = "") -> ReachRow:
+def reach_row(distance: BudgetDistance, note: str = "") -> ReachRow:
     """Return name, distance on this drive, on the next one, and note of a row of a report."""
-    low, high = one.between_m
-    if not note and high - low > NEAR_HORIZONS_M and not one.beyond:
+    low, high = distance.between_m
+    if not note and high - low > NEAR_HORIZONS_M and not distance.beyond:
         note = f"between {low:g} and {high:g} m"
-    return one.model, one.short_text, one.next_text, note
+    return distance.model, distance.short_text, distance.next_text, note
 
 
 def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
@@ -204,8 +204,8 @@ def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
         for score in used.calibration.other_grounds or ()
     }
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
-        known = [one for one in report.budgets if one.budget_m == budget_m and one.other_text]
-        wheels = [one for one in known if not turned_by(one.model)]
+        distances = [one for one in report.budgets if one.budget_m == budget_m and one.other_text]
+        wheels = [one for one in distances if not turned_by(one.model)]
         if wheels:
             best = max(wheels, key=lambda one: math.inf if one.other_low_m is None else one.other_low_m or 0.0)
             of_budget = f"{best.other_text} within {budget_m:g} m (9 of 10) with {best.model}"
@@ -214,11 +214,11 @@ def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
 
 def heading_lines(report: DropoutDocument) -> Iterator[str]:
     """Yield a line with the remedy if the heading at the start makes most of the error of the best row."""
-    found = UNSET if report.best is None else report.best.start_heading
-    if report.best is not None and found is not UNSET and found.dominates:
-        whole = f"{error_text(found.p95_m)} after {report.best.horizon_m:g} m (95 %)"
-        left = f"{error_text(found.aligned_p95_m)} remain with aligned headings"
-        yield f"the heading at the start makes most of the error: {whole}, of which {left}; {found.mend}"
+    start_heading = UNSET if report.best is None else report.best.start_heading
+    if report.best is not None and start_heading is not UNSET and start_heading.dominates:
+        whole = f"{error_text(start_heading.p95_m)} after {report.best.horizon_m:g} m (95 %)"
+        remainder = f"{error_text(start_heading.aligned_p95_m)} remain with aligned headings"
+        yield f"the heading at the start makes most of the error: {whole}, of which {remainder}; {start_heading.mend}"
 
 
 def sensor_lines(report: DropoutDocument) -> Iterator[str]:
@@ -247,8 +247,8 @@ def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
         grade, lead, why = "bad", "no:", summary.unusable_because or "an acceptance limit is not met"
     if count := sum(not is_grave(one) for one in summary.notes):
         checks.append(Check("care", "log", f"{counted(count, 'warning')} about it"))
-    found = Section("", [Checks(sorted(checks, key=lambda one: one.grade != "care"))], VERBOSE)
-    return Section("May I trust it?", [found], lead=lead, text=why, label="Trust?", grade=grade, name="trust")
+    section = Section("", [Checks(sorted(checks, key=lambda one: one.grade != "care"))], VERBOSE)
+    return Section("May I trust it?", [section], lead=lead, text=why, label="Trust?", grade=grade, name="trust")
 
 
 def verdict_lines(report: DropoutDocument) -> list[Line]:
@@ -286,15 +286,15 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
     return Section("Worst cases", blocks, PAGE, name="worst")
 
 
-def _meanwhile(one: TrialDocument, summary: RunDocument, report: DropoutDocument) -> str:
+def _meanwhile(trial: TrialDocument, summary: RunDocument, report: DropoutDocument) -> str:
     """Return what happened during a trial: jumps of the position, outages, slip."""
-    speed = one.speed_mean_mps
-    end_s = one.t_s + (one.horizon_m / speed if speed else 0.0)
-    end_ns = one.stamp_ns + round(1e9 * (end_s - one.t_s))
-    sizes = [jump.size_m for jump in summary.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > one.stamp_ns]
+    speed = trial.speed_mean_mps
+    end_s = trial.t_s + (trial.horizon_m / speed if speed else 0.0)
+    end_ns = trial.stamp_ns + round(1e9 * (end_s - trial.t_s))
+    sizes = [jump.size_m for jump in summary.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > trial.stamp_ns]
     real = [out for out in report.outages if out.kind == "real"]
-    lost = [out for out in real if out.begin_s < end_s and out.end_s > one.t_s]
-    slips = [slip.kind for slip in summary.events if slip.begin_s < end_s and slip.end_s > one.t_s]
+    lost = [out for out in real if out.begin_s < end_s and out.end_s > trial.t_s]
+    slips = [slip.kind for slip in summary.events if slip.begin_s < end_s and slip.end_s > trial.t_s]
     notes = [f"the position steps by {error_text(max(sizes))}"] if sizes else []
     notes += [f"outage of {duration_text(out.end_s - out.begin_s)}" for out in lost[:1]]
     notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
@@ -326,17 +326,20 @@ def outage_blocks(report: DropoutDocument) -> list[Block]:
 
 def p95_at(report: DropoutDocument, model: str, distance_m: float) -> float | None:
     """Return a model's p95 [m] at the horizon nearest to a distance; None beyond the last one, or without trials."""
-    found = model_of(report, model)
-    if found is None or not found.by_horizon or distance_m > found.by_horizon[-1].horizon_m:
+    document = model_of(report, model)
+    if document is None or not document.by_horizon or distance_m > document.by_horizon[-1].horizon_m:
         return None
-    return min(found.by_horizon, key=lambda row: abs(row.horizon_m - distance_m)).p95_m
+    return min(document.by_horizon, key=lambda row: abs(row.horizon_m - distance_m)).p95_m
 
 
 def model_section(report: DropoutDocument) -> Section:
     """Return the parameters of the recommended motion model, and how the models were compared."""
     parameters: list[Block] = []
-    if (found := report.recommended) is not None:
-        parameters = [parameter_table(fitted_model(found.model, found)), *(one.sentence for one in found.notes)]
+    if (recommended := report.recommended) is not None:
+        parameters = [
+            parameter_table(fitted_model(recommended.model, recommended)),
+            *(one.sentence for one in recommended.notes),
+        ]
     notes = [one.sentence for one in report.ladder.notes or ()]
     blocks: list[Block] = [Section("Parameters of the motion model", parameters, VERBOSE), *notes]
     return Section("The motion model", blocks, VERBOSE, name="models")

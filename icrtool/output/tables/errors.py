@@ -58,22 +58,22 @@ def ordered(models: Sequence[ModelDocument]) -> list[ModelDocument]:
 def trials_of_first(report: DropoutDocument) -> list[int]:
     """Return the number of trials of the row that is shown first, at each horizon of a report."""
     first = shown_rows([one.name for one in report.models])[:1]
-    found = model_of(report, first[0]) if first else None
-    return [row.trials for row in (report.trials if found is None else found.by_horizon)]
+    document = model_of(report, first[0]) if first else None
+    return [row.trials for row in (report.trials if document is None else document.by_horizon)]
 
 
 def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     """Return the errors over distance: what counts first, then all of them, and what they rest on."""
-    shown = shown_horizons(np.array([row.horizon_m for row in report.trials]))
-    counts = [report.trials[h] for h in shown]
+    horizons = shown_horizons(np.array([row.horizon_m for row in report.trials]))
+    counts = [report.trials[h] for h in horizons]
     main, models = shown_rows([one.name for one in report.models]), ordered(report.models)
-    rows = [_error_row(one, shown) for one in models if one.name in main]
-    others = [_error_row(one, shown) for one in models if one.name not in main]
+    rows = [_error_row(one, horizons) for one in models if one.name in main]
+    others = [_error_row(one, horizons) for one in models if one.name not in main]
     trials = trials_of_first(report)
-    rows.append(["trials", "", *(f"{trials[h]:,}" for h in shown)])
+    rows.append(["trials", "", *(f"{trials[h]:,}" for h in horizons)])
     head = ("distance without GNSS", "", *(f"{row.horizon_m:g} m" for row in counts))
     sentences = [*_source_lines(report), *_count_lines(report, summary)]
-    rests = [Table("llr", list(_other_rows(report, shown)), head), *sentences, *_learned_blocks(report, shown)]
+    rests = [Table("llr", list(_other_rows(report, horizons)), head), *sentences, *_learned_blocks(report, horizons)]
     for split in report.by_turning:
         kind = "straight" if split.straight else "turning"
         errors = ", ".join(f"{name} {error_text(error)}" for name, error in split.expected_m.items())
@@ -95,10 +95,10 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     )
 
 
-def _error_row(model: ModelDocument, shown: Sequence[int]) -> list[str | Cell]:
+def _error_row(model: ModelDocument, horizons: Sequence[int]) -> list[str | Cell]:
     """Return 95 %, its interval and the expected error of a model."""
     cells = []
-    for row in (model.by_horizon[h] for h in shown):
+    for row in (model.by_horizon[h] for h in horizons):
         low, high = row.p95_low_m, row.p95_high_m
         interval = "too short" if low is None else f"{error_text(low).removesuffix(' m')}-{error_text(high)}"
         cells.append(_error_cell(row.horizon_m, row.p95_m, row.expected_error_m, interval))
@@ -111,21 +111,21 @@ def _error_cell(horizon_m: float, p95_m: float | None, expected_m: float | None,
     return Cell(error_text(p95_m), share, (*interval, f"{error_text(expected_m)} {expected_share:>7}"))
 
 
-def _other_rows(report: DropoutDocument, shown: Sequence[int]) -> Iterator[list[str | Cell]]:
+def _other_rows(report: DropoutDocument, horizons: Sequence[int]) -> Iterator[list[str | Cell]]:
     """Yield what a perfect model would show, what the ICRs gain, and why starts gave no trial."""
     kinds, icr, no_slip = Cell("95 %", more=("expected",)), model_of(report, "icr"), model_of(report, "no_slip")
     if any(row.p95_m is not None for row in report.reference_error):
-        own = (report.reference_error[h] for h in shown)
-        yield ["reference alone", kinds, *(_error_cell(row.horizon_m, row.p95_m, row.expected_m) for row in own)]
+        reference = (report.reference_error[h] for h in horizons)
+        yield ["reference alone", kinds, *(_error_cell(row.horizon_m, row.p95_m, row.expected_m) for row in reference)]
     if icr is not None and no_slip is not None:
         cells = []
-        for ours, theirs in ((icr.by_horizon[h], no_slip.by_horizon[h]) for h in shown):
+        for ours, theirs in ((icr.by_horizon[h], no_slip.by_horizon[h]) for h in horizons):
             pairs = (theirs.p95_m, ours.p95_m), (theirs.expected_error_m, ours.expected_error_m)
             p95, expected = (f"{over / under:.1f} x" if over is not None and under else "-" for over, under in pairs)
             cells.append(Cell(p95, more=(expected,)))
         yield ["no_slip / icr", kinds, *cells]
     for key, label in NO_TRIAL.items():
-        counts = [report.trials[h].no_trial.get(key, 0) for h in shown]
+        counts = [report.trials[h].no_trial.get(key, 0) for h in horizons]
         if any(counts):
             yield [label, "", *(f"{count:,}" for count in counts)]
 
@@ -138,12 +138,12 @@ def _source_lines(report: DropoutDocument) -> Iterator[str]:
     yield from (f"learned from {knows}: {', '.join(names)}" for knows, names in learned.items())
     for used in report.calibrations:
         yield f"{used.name}: {used.model} from {counted(used.logs, 'log')}, {used.created[:10]}, {used.fitted}"
-    known, icr = [row for row in report.reference_error if row.p95_m is not None], model_of(report, "icr")
-    if known and icr is not None:
-        own = min(known, key=lambda row: abs(row.horizon_m - CHOICE_HORIZON_M))
-        whole = next(row.p95_m for row in icr.by_horizon if row.horizon_m == own.horizon_m)
-        what = f"the {error_text(whole)} of icr (95 %, {own.horizon_m:g} m)"
-        yield f"up to {error_text(own.p95_m)} of {what} can be the error of the position reference"
+    rows, icr = [row for row in report.reference_error if row.p95_m is not None], model_of(report, "icr")
+    if rows and icr is not None:
+        nearest = min(rows, key=lambda row: abs(row.horizon_m - CHOICE_HORIZON_M))
+        whole = next(row.p95_m for row in icr.by_horizon if row.horizon_m == nearest.horizon_m)
+        what = f"the {error_text(whole)} of icr (95 %, {nearest.horizon_m:g} m)"
+        yield f"up to {error_text(nearest.p95_m)} of {what} can be the error of the position reference"
 
 
 def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]:
@@ -193,7 +193,7 @@ def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
     return [f"{left_out}: icr after {after.horizon_m:g} m 95 % {errors} ({crossing:,} trials cross one)"]
 
 
-def _learned_blocks(report: DropoutDocument, shown: Sequence[int]) -> Iterator[Block]:
+def _learned_blocks(report: DropoutDocument, horizons: Sequence[int]) -> Iterator[Block]:
     """Yield the errors of the momentary ICRs before and after the ICRs were first learned."""
     split = report.by_learning
     if split is None:
@@ -201,16 +201,16 @@ def _learned_blocks(report: DropoutDocument, shown: Sequence[int]) -> Iterator[B
     if split.learned_s is None or split.learned_at_distance_m is None:
         yield "the ICRs were never learned: their standard deviations hardly fell in this drive"
         return
-    if not any(split.before[h].trials for h in shown):
+    if not any(split.before[h].trials for h in horizons):
         return
     rows = []
     for name, part in (("  before", split.before), ("  after", split.after)):
-        errors = ((error_text(part[h].p95_m), error_text(part[h].expected_error_m)) for h in shown)
+        errors = ((error_text(part[h].p95_m), error_text(part[h].expected_error_m)) for h in horizons)
         cells = [" / ".join(error.removesuffix(" m") for error in pair) for pair in errors]
-        rows.append([name, *(cell if part[h].trials else "-" for cell, h in zip(cells, shown, strict=True))])
+        rows.append([name, *(cell if part[h].trials else "-" for cell, h in zip(cells, horizons, strict=True))])
     when = f"{duration_text(split.learned_s)}, {distance_text(split.learned_at_distance_m)}"
     caption = f"icr before and after the ICRs were first learned ({when}): 95 % / expected [m]"
-    yield Table("lr", rows, ("", *(f"{report.trials[h].horizon_m:g} m" for h in shown)), caption)
+    yield Table("lr", rows, ("", *(f"{report.trials[h].horizon_m:g} m" for h in horizons)), caption)
 
 
 def baseline_sections(report: DropoutReport) -> Iterator[Section]:

@@ -135,8 +135,8 @@ def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | N
         for one in sources:
             is_used = stream is not None and one.topic == stream.topic
             refused = "used although unsuitable, because it is configured" if is_used else "cannot be used"
-            found = f"{refused}: {one.problem}" if one.problem else one.why
-            blocks.append(f"  {'*' if is_used else '-'} {one.topic} ({one.message_type}; {one.stamps}): {found}")
+            finding = f"{refused}: {one.problem}" if one.problem else one.why
+            blocks.append(f"  {'*' if is_used else '-'} {one.topic} ({one.message_type}; {one.stamps}): {finding}")
         if stream is not None:
             jitter = f", jitter {stream.jitter_ms:.3g} ms" if stream.jitter_ms is not None else ""
             blocks += [f"  -> {stream.topic}: {stream.why}"]
@@ -153,15 +153,15 @@ def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | N
         yield Section("", [f"all three overlap for {max(overlap, 0):.1f} s"], VERBOSE)
 
 
-def _topic_text(one: SurveyedTopic) -> str:
-    if one.not_read_because is not None and not one.read:
-        return f"not read: {one.not_read_because}"
-    parts = [] if one.messages is None else [counted(one.messages, "message")]
-    if not one.read:
+def _topic_text(topic: SurveyedTopic) -> str:
+    if topic.not_read_because is not None and not topic.read:
+        return f"not read: {topic.not_read_because}"
+    parts = [] if topic.messages is None else [counted(topic.messages, "message")]
+    if not topic.read:
         return ", ".join([*parts, "no role"])
-    parts += [f"{one.rate_hz:.4g} Hz"] if one.rate_hz else []
-    parts += [f"{counted(one.gaps, 'gap')} up to {one.longest_gap_s:.1f} s"] if one.gaps else []
-    return ", ".join([*parts, f"{one.unreadable} unreadable"] if one.unreadable else parts)
+    parts += [f"{topic.rate_hz:.4g} Hz"] if topic.rate_hz else []
+    parts += [f"{counted(topic.gaps, 'gap')} up to {topic.longest_gap_s:.1f} s"] if topic.gaps else []
+    return ", ".join([*parts, f"{topic.unreadable} unreadable"] if topic.unreadable else parts)
 
 
 def verdict(run: Run | None, problem: IcrToolError | None, names: Sequence[str]) -> str:

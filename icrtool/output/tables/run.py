@@ -127,11 +127,11 @@ def unstated_grounds(summary: RunDocument) -> tuple[GroundStretch, ...]:
 
 def _stretch_rows(stretches: Sequence[GroundStretch]) -> list[Row]:
     """Return time and multiplier ± σ of stretches, two on a line."""
-    found = [
+    rows = [
         f"{one.begin_s:.0f} to {one.end_s:.0f} s: {one.multiplier:.3f} ± {max(one.multiplier_std, 0.001):.3f}"
         for one in stretches
     ]
-    return [("" if row else "multiplier", ", ".join(found[row : row + 2])) for row in range(0, len(found), 2)]
+    return [("" if row else "multiplier", ", ".join(rows[row : row + 2])) for row in range(0, len(rows), 2)]
 
 
 def next_line(command: str) -> Line:
@@ -185,27 +185,29 @@ def blocks_of_numbers(
 
 
 def _icr_row(icrs: Sequence[tuple[float, float] | None]) -> Row:
-    found = zip(ICR_WORDS.values(), icrs, strict=True)
-    return "ICRs [m]", ", ".join(f"{word.removeprefix('y ')} {icr_text(*(icr or (None, None)))}" for word, icr in found)
+    named_icrs = zip(ICR_WORDS.values(), icrs, strict=True)
+    return "ICRs [m]", ", ".join(
+        f"{word.removeprefix('y ')} {icr_text(*(icr or (None, None)))}" for word, icr in named_icrs
+    )
 
 
 def run_checks(summary: RunDocument) -> list[Check]:
     """Return what was checked of a run, each with its finding and its details."""
-    found = [*_filter_check(summary), excitation_check(summary)]
-    found += [*_fix_checks(summary), *_heading_checks(summary), *_delay_checks(summary)]
+    checks = [*_filter_check(summary), excitation_check(summary)]
+    checks += [*_fix_checks(summary), *_heading_checks(summary), *_delay_checks(summary)]
     if spans := summary.outages_ns:
         away = duration_text(sum(end - begin for begin, end in spans) / 1e9)
         lost = len(summary.rtk_losses_ns)
         cause = (f"{lost} by loss of RTK",) if lost else ()
-        found.append(Check("care", "outages", f"{len(spans)}, {away} in all", cause))
+        checks.append(Check("care", "outages", f"{len(spans)}, {away} in all", cause))
     if events := summary.events:
         kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(event.kind for event in events).items())
         worst = max(events, key=lambda event: (event.end_s - event.begin_s) * event.severity)
         lasted = duration_text(worst.end_s - worst.begin_s)
         missed = f"{100 * worst.severity:.0f} % of the wheels' motion missed"
         most = f"worst: {worst.kind} from {worst.begin_s:.1f} s for {lasted}, {missed}"
-        found.append(Check("care", "slip events", f"{kinds}; left out of the fit", (most,)))
-    return found
+        checks.append(Check("care", "slip events", f"{kinds}; left out of the fit", (most,)))
+    return checks
 
 
 def _filter_check(summary: RunDocument) -> Iterator[Check]:
@@ -293,17 +295,17 @@ def _delay_checks(summary: RunDocument) -> Iterator[Check]:
     """Yield which streams seem to lag or lead the wheels."""
     if summary.filter.reference_delay_s or summary.heading.applied_delay_s:
         return
-    found = []
+    checks = []
     for word, facts in (("headings", summary.heading), ("fixes", summary.gnss)):
         delay, std = facts.delay_s, facts.delay_std_s
         if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, CORRECTION_SIGMAS * std):
-            found.append(
+            checks.append(
                 f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {plus_minus(abs(delay), std, 2, '')} s"
             )
     multiplier = summary.icr.separation_multiplier
     slips = multiplier is None or multiplier > SLIPPING_MULTIPLIER
     cause = "slip of the wheels" if slips else f"the robot's response to its wheels, up to {RESPONSE_S:g} s,"
-    lines = [*found, f"not corrected: {cause} has the same effect"] if found else []
+    lines = [*checks, f"not corrected: {cause} has the same effect"] if checks else []
     speed = summary.drive.speed_mean_mps
     if summary.gnss.delay_s is None and summary.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
         shift = error_text(TYPICAL_DELAY_S * speed)
@@ -316,15 +318,15 @@ def corrections(summary: RunDocument) -> list[str]:
     """Return what the alignment corrected, a few words each."""
     applied = {name: one.applied for name, one in summary.alignment.items()}
     scale, left, right = (applied.get(name) or 1.0 for name in ("wheel_scale", "left_scale", "right_scale"))
-    found = [f"wheels {100 * scale:.1f} %"] if abs(scale - 1.0) > NOTED_SCALE else []
+    texts = [f"wheels {100 * scale:.1f} %"] if abs(scale - 1.0) > NOTED_SCALE else []
     if abs(left - right) > NOTED_SCALE:
         side, share = ("left", (right - left) / right) if left < right else ("right", (left - right) / left)
-        found.append(f"{side} {100 * share:.1f} % less")
+        texts.append(f"{side} {100 * share:.1f} % less")
     if abs(offset := summary.heading.applied_offset_deg) >= SMALLEST_OFFSET_DEG:
-        found.append(f"heading {-offset:+z.1f}°")
+        texts.append(f"heading {-offset:+z.1f}°")
     delays = (("position", summary.filter.reference_delay_s), ("heading", summary.heading.applied_delay_s))
-    found += [f"{word} {'lag' if delay > 0 else 'lead'} {abs(delay):.2f} s" for word, delay in delays if delay]
-    return found
+    texts += [f"{word} {'lag' if delay > 0 else 'lead'} {abs(delay):.2f} s" for word, delay in delays if delay]
+    return texts
 
 
 def to_drive(summary: RunDocument) -> str:
@@ -351,11 +353,11 @@ def streams_section(summary: RunDocument) -> Section:
 
 def _odometry_table(summary: RunDocument) -> Iterator[Table]:
     """Yield the errors of the paths by wheel speeds alone; nothing for a run of an earlier version."""
-    named = {"final ICRs": "icr", "momentary ICRs": "icr_momentary", "no slip": "no_slip"}
-    known = {words: getattr(summary.odometry, name) for words, name in named.items()}
+    names = {"final ICRs": "icr", "momentary ICRs": "icr_momentary", "no slip": "no_slip"}
+    errors = {words: getattr(summary.odometry, name) for words, name in names.items()}
     rows = [
         (words, *(error_text(metres) for metres in (one.mean_error_m, one.max_error_m, one.end_error_m)))
-        for words, one in known.items()
+        for words, one in errors.items()
         if one is not None and one is not UNSET and one.mean_error_m is not UNSET
     ]
     if rows:
@@ -366,15 +368,15 @@ def _icr_tables(summary: RunDocument) -> Iterator[Table]:
     """Yield the ICRs of the drive, the convergence of the filter's ICRs, and the ICRs between the terrain changes."""
     icr, rows = summary.icr, []
     for column in ICR_COLUMNS:
-        found = icr_text(*(summary.icr_of_drive(column) or (None, None)))
+        of_drive = icr_text(*(summary.icr_of_drive(column) or (None, None)))
         mean, std, time_s = icr.mean[column], icr.std[column], icr.convergence_s[column]
         if mean is None:
-            rows.append((ICR_WORDS[column], found, "", "", "", ""))
+            rows.append((ICR_WORDS[column], of_drive, "", "", "", ""))
             continue
         convergence = f"{time_s:.1f} s" if time_s is not None else "none"
         final = icr_text(icr.final[column], icr.final_std[column])
         verdict = NOT_SHOWN_WORDS.get(summary.excitation.verdict[column], "")
-        rows.append((ICR_WORDS[column], found, final, convergence, plus_minus(mean, std), verdict))
+        rows.append((ICR_WORDS[column], of_drive, final, convergence, plus_minus(mean, std), verdict))
     yield Table("lrrrrl", rows, ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", ""))
     segments = []
     for number, segment in enumerate(summary.segments, start=1):

@@ -50,20 +50,20 @@ def study_blocks(result: StudyResult) -> list[Block]:
     return [*blocks, Table("l", rows, ("", "ours", "expected" if request.name == "consistency" else "paper"))]
 
 
-def _level_rows(level: Level, shown: dict[str, str]) -> list[list[str]]:
+def _level_rows(level: Level, heads: dict[str, str]) -> list[list[str]]:
     """Return the medians of a setting, and below them the 5th and 95th percentiles over its runs."""
     value = level.setting.value
     first, second = [level.setting.series, value if isinstance(value, str) else f"{value:g}"], ["", ""]
-    for name in shown:
-        found = level.metrics()[name]
-        form, never = "+z.3f" if name in ERROR_WORDS else ".3g", len(level.found[name]) - found["count"]
+    for name in heads:
+        metric = level.metrics()[name]
+        form, never = "+z.3f" if name in ERROR_WORDS else ".3g", len(level.found[name]) - metric["count"]
         if name == "inverted":
-            middle, around = f"{100 * found['mean']:.0f} %", ""
-        elif not found["count"]:
+            middle, around = f"{100 * metric['mean']:.0f} %", ""
+        elif not metric["count"]:
             middle, around = "never", ""
         else:
-            middle = f"{found['p50']:{form}}{f', never in {never}' if never else ''}"
-            around = f"[{found['p5']:{form}}, {found['p95']:{form}}]"
+            middle = f"{metric['p50']:{form}}{f', never in {never}' if never else ''}"
+            around = f"[{metric['p5']:{form}}, {metric['p95']:{form}}]"
         first.append(middle)
         second.append(around)
     return [first, second] if any(second) else [first]
