@@ -30,8 +30,8 @@ from icrtool.alignment.wheel_units import with_right_size, with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.records.measurements import Finding, LogFacts, Measurements, SensorData
-from icrtool.records.notes import about, note
-from icrtool.records.plain_data import known
+from icrtool.records.notes import note, notes_about
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
@@ -131,7 +131,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
             heading_correlation_s=max(config.filter.heading_correlation_s, streams.correlation_s),
             heading_is_estimated=derived is not None,
             heading_is_measured=math.isfinite(heading_std_rad),
-            turn_wander_rad=None if streams.fit is None else known(streams.fit.turn_wander_rad),
+            turn_wander_rad=None if streams.fit is None else finite_or_none(streams.fit.turn_wander_rad),
             antenna_m=antenna_m,
             antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
             clock_std_s=streams.delays.clock_std_s,
@@ -275,10 +275,10 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
     """Return the log with the position reference that its wheels and headings support; preset ``paper``: as it is."""
     if not log.other_references or not config.filter.rules.corrects or not len(log.heading.stamp_ns):
         return log
-    chosen = agreement(log, config)
+    chosen = measure_agreement(log, config)
     if chosen.residual_m <= POOR_M:
         return log
-    candidates = [(agreement(other, config), other) for other in log.other_references]
+    candidates = [(measure_agreement(other, config), other) for other in log.other_references]
     least = LEAST_SHARE_COVERED * chosen.distance_m
     fit = [(one.residual_m, other) for one, other in candidates if one.distance_m > least]
     residual, best = min(fit, key=lambda one: one[0], default=(math.inf, log))
@@ -296,7 +296,7 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
     return replace(best, streams=streams, notes=(*best.notes, found_better))
 
 
-def agreement(log: RobotLog, config: Config) -> Agreement:
+def measure_agreement(log: RobotLog, config: Config) -> Agreement:
     """Return how the position reference of a log agrees with its wheels along its heading."""
     width = width_or_usual_m(config.robot.track_width_m)
     log, config, _ = with_configured_delays(log, config)

@@ -43,13 +43,13 @@ from icrtool.alignment.wheel_alignment import (
     align_wheels,
     configured_scales,
     dead_or_copied,
-    scaled,
+    with_scaled_wheels,
 )
 from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.config import Config
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S, HeadingFacts, WheelFacts
-from icrtool.records.notes import Note, about, note
+from icrtool.records.notes import Note, note, notes_about
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
@@ -252,7 +252,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         configured = configured[::-1]
     wheels, scales, of_wheels = align_wheels(log, config, fit, configured, sound=sound)
     delays, of_delays = find_delays(log, config, fit)
-    log = scaled(log, *scales)
+    log = with_scaled_wheels(log, *scales)
     lags = {"gnss": delays.applied_gnss_s, "heading": delays.applied_heading_s}
     lags["heading"] = lags["gnss"] if delays.together else lags["heading"]
     moved: dict[str, Any] = {
@@ -261,7 +261,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         if lags[name] != 0.0
     }
     log = replace(log, **moved) if moved else log
-    findings = about(log.name, (*notes, *of_wheels, *of_heading, *of_delays))
+    findings = notes_about(log.name, (*notes, *of_wheels, *of_heading, *of_delays))
     return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, findings)
 
 
@@ -276,7 +276,7 @@ def _name_streams(
     windows with it in any preset; what to report; whether no side is dead or a copy of the other
     """
     corrects, derived, senses = config.filter.rules.corrects, None, AS_NAMED
-    log = scaled(log, *configured_scales(config))
+    log = with_scaled_wheels(log, *configured_scales(config))
     if not len(log.heading.stamp_ns) and corrects:
         if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) > 1:
             senses = senses_by_distance(track_of_log(log))

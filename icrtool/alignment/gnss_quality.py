@@ -25,7 +25,7 @@ from icrtool.alignment.sensor_noise import (
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.measurements import Fixes, FixStatistics
-from icrtool.records.notes import Note, about, note
+from icrtool.records.notes import Note, note, notes_about
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 from icrtool.records.tables import RobotLog
 
@@ -108,7 +108,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
     std_m = {name: float(np.median(stds)) if len(stds) else math.nan for name, stds in known_std.items()}
     losses = _losses(gnss.stamp_ns, fixed) if norm else np.empty((0, 2), np.int64)
     notes = _notes(fixes, stated, used_std, raised, changes=changes)
-    return GnssQuality(fixes, FixStatistics(std_m, white), losses, about(log.name, notes))
+    return GnssQuality(fixes, FixStatistics(std_m, white), losses, notes_about(log.name, notes))
 
 
 def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:

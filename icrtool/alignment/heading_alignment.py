@@ -12,12 +12,12 @@ from icrtool.alignment.conventions import Convention
 from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit
 from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS, STARTS_A_WINDOW, DriveWindows
-from icrtool.alignment.sensor_noise import unbroken
+from icrtool.alignment.sensor_noise import unbroken_intervals
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.records.measurements import HeadingFacts
 from icrtool.records.notes import Note, note
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.samples import Datum
 from icrtool.records.tables import RobotLog
 
@@ -235,17 +235,17 @@ def align_heading(
         parts=None if derived is None else derived.why,
         windows=course.windows,
         applied_mirror=mirrored and corrects,
-        offset_deg=known(math.degrees(offset)),
-        offset_std_deg=known(math.degrees(std)),
-        scatter_deg=known(math.degrees(scatter)),
+        offset_deg=finite_or_none(math.degrees(offset)),
+        offset_std_deg=finite_or_none(math.degrees(std)),
+        scatter_deg=finite_or_none(math.degrees(scatter)),
         applied_offset_deg=math.degrees(applied),
         applied_std_deg=math.degrees(scatter) if noisy else 0.0,
-        std_deg=None if derived is None else known(math.degrees(derived.estimate.median_causal_std)),
+        std_deg=None if derived is None else finite_or_none(math.degrees(derived.estimate.median_causal_std)),
         offset_name=name.text or None,
         magnetic_declination_deg=name.declination_deg,
         utm_convergence_deg=name.convergence_deg,
-        agreement=known(course.agreement),
-        mirrored_agreement=known(course.mirrored_agreement),
+        agreement=finite_or_none(course.agreement),
+        mirrored_agreement=finite_or_none(course.mirrored_agreement),
     )
     return facts, correlation_s, notes
 
@@ -327,7 +327,7 @@ def refuse_stuck(log: RobotLog) -> None:
     long = end - begin > STUCK_S * 1e9
     if not long.any():
         return
-    interval = unbroken(np.diff(wheels.stamp_ns) / 1e9)
+    interval = unbroken_intervals(np.diff(wheels.stamp_ns) / 1e9)
     left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
     gone = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
     ahead = np.concatenate([[0.0], np.cumsum(left - right)])

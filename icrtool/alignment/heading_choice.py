@@ -31,7 +31,7 @@ from icrtool.records.samples import (
     GyroSamples,
     HeadingSamples,
     StreamChoice,
-    thin,
+    without_repeats,
 )
 from icrtool.records.tables import RobotLog
 
@@ -257,7 +257,9 @@ def _derived(
         source = "fused"
         parts[0] += f" (error {math.degrees(estimate.noises[WANDERS]):.1f}°)"
         lag = round(float(estimate.constants[LAG]) * 1e9)
-        attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - estimate.offset[0], thin(stated.var_rad2))
+        attitude = HeadingSamples(
+            stated.stamp_ns - lag, stated.heading_rad - estimate.offset[0], without_repeats(stated.var_rad2)
+        )
     stamps, turn_stamps = (epoch + np.round(t * 1e9).astype(np.int64) for t in (estimate.t, turn.t))
     causal, smoothed = wrapped(estimate.causal), wrapped(estimate.smoothed)
     # the causal heading begins where it is known, and again after a hole of the turn rate

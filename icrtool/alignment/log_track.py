@@ -13,9 +13,9 @@ from icrtool.alignment.sensor_noise import (
     MEDIAN_OF_RAYLEIGH,
     NOISIER,
     USUAL_POSITION_STD_M,
-    unbroken,
+    unbroken_intervals,
 )
-from icrtool.alignment.sparse_reference import carried, spans_of_measured
+from icrtool.alignment.sparse_reference import spans_of_measured, with_carried_heading
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, in_spans, runs_of, unwrapped
 from icrtool.kernels.track import Track, Windows, cut
@@ -112,7 +112,7 @@ def track_of_streams(
     wheel_t, fix_t, heading_t = (
         (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
     )
-    held = np.append(unbroken(np.diff(wheel_t)), 0.0)
+    held = np.append(unbroken_intervals(np.diff(wheel_t)), 0.0)
     for span in slipping_ns:
         held[slice(*np.searchsorted(wheels.stamp_ns, span))] = 0.0
     left, right = wheels.v_left_mps, wheels.v_right_mps
@@ -134,7 +134,7 @@ def track_of_streams(
         begins = (held == 0.0) | np.append(True, held[:-1] == 0.0)
         begins[_thinned(turns)] = begins[-1] = True
         track = track.joined(np.flatnonzero(begins))
-    return carried(track._replace(distance=np.interp(fix_t, track.t, track.travel)))
+    return with_carried_heading(track._replace(distance=np.interp(fix_t, track.t, track.travel)))
 
 
 def _thinned(busy: Bools) -> Ints:

@@ -135,7 +135,7 @@ def is_hole(interval_s: Floats, least_s: float = 1e-6) -> Bools:
     return np.asarray(interval_s > max(least_s, HOLE_IN_INTERVALS * usual))
 
 
-def unbroken(interval_s: Floats) -> Floats:
+def unbroken_intervals(interval_s: Floats) -> Floats:
     """Return intervals between wheel samples [s], zero for those that are too long to show what happened in them."""
     return np.where(is_hole(interval_s, WHEEL_HOLE_S), 0.0, interval_s)
 
@@ -173,7 +173,7 @@ def without_frozen(log: RobotLog) -> RobotLog:
     if log.datum is None or min(len(gnss.stamp_ns), len(wheels.stamp_ns)) < 2:
         return log
     speed = np.abs(wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
-    gone = np.concatenate([[0.0], np.cumsum(speed * unbroken(np.diff(wheels.stamp_ns) / 1e9))])
+    gone = np.concatenate([[0.0], np.cumsum(speed * unbroken_intervals(np.diff(wheels.stamp_ns) / 1e9))])
     travel = np.interp(gnss.stamp_ns, wheels.stamp_ns, gone)
     moves = (np.diff(axis, prepend=np.nan) != 0.0 for axis in (gnss.north_m, gnss.east_m))
     first = np.flatnonzero(np.logical_or(*moves))

@@ -31,7 +31,7 @@ AGREED_COSINE = 0.7
 and 0.7 for errors of 48 deg (rms)."""
 
 
-def carried(track: Track) -> Track:
+def with_carried_heading(track: Track) -> Track:
     """Return the track with a heading at each wheel sample where its headings are rare; else the same track.
 
     Notes

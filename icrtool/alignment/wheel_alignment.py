@@ -17,7 +17,7 @@ import numpy as np
 from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit, residuals_by_estimate
 from icrtool.alignment.ground_change import find_changes
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
-from icrtool.alignment.sensor_noise import unbroken
+from icrtool.alignment.sensor_noise import unbroken_intervals
 from icrtool.alignment.sparse_reference import spans_of_measured
 from icrtool.alignment.wheel_units import Scale, is_wrong_size, radius_hint
 from icrtool.config import Config
@@ -26,7 +26,7 @@ from icrtool.kernels.robust import robust_regression, sandwich_covariance
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import Fixes, WheelFacts
 from icrtool.records.notes import Note, note
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import RobotLog
 
@@ -76,7 +76,7 @@ def configured_scales(config: Config) -> tuple[float, float]:
     return 1.0 if left == "auto" else left, 1.0 if right == "auto" else right
 
 
-def scaled(log: RobotLog, left_factor: float, right_factor: float) -> RobotLog:
+def with_scaled_wheels(log: RobotLog, left_factor: float, right_factor: float) -> RobotLog:
     """Return the log with the speeds of its sides multiplied; the same log where both factors are 1."""
     if left_factor == right_factor == 1.0:
         return log
@@ -108,7 +108,7 @@ def _contradicted(wheels: WheelSamples, fixes: Fixes) -> Bools:
     return np.asarray(apart & seen[:-1] & seen[1:])
 
 
-def bridged(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[WheelSamples, Note | None]:
+def bridge_gaps(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[WheelSamples, Note | None]:
     """Return wheels that report positions with samples in their gaps, and a finding.
 
     Parameters
@@ -145,7 +145,7 @@ def dead_or_copied(log: RobotLog) -> list[Note]:
     """Return a warning where a side never moves while the other does, or copies the other while the robot turns."""
     left, right = log.wheels.v_left_mps, log.wheels.v_right_mps
     seconds = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
-    interval = unbroken(np.diff(seconds, append=seconds[-1:]))
+    interval = unbroken_intervals(np.diff(seconds, append=seconds[-1:]))
     for side, still, moving in (("left", left, right), ("right", right, left)):
         still_m, gone = np.cumsum(still * interval), np.cumsum(np.abs(moving) * interval)
         # the longest distance of one side over which the other hardly moves, compared at every metre
@@ -192,8 +192,8 @@ def align_wheels(
     windows = 0 if fit is None else len(fit.windows.begin)
     turn_unexplained, turn_unexplained_std = (math.nan, math.nan) if fit is None else unexplained_turn_variance(fit)
     facts = WheelFacts(
-        scale=known(scale),
-        scale_std=known(std),
+        scale=finite_or_none(scale),
+        scale_std=finite_or_none(std),
         applied_scale=(applied[0] + applied[1]) / 2,
         applied_left_scale=applied[0] * abs(configured[0]),
         applied_right_scale=applied[1] * abs(configured[1]),
@@ -201,9 +201,9 @@ def align_wheels(
         filtered=filtered or None,
         windows=windows,
         stretches=0 if fit is None else len(np.union1d(fit.windows.group, fit.windows.turn_group)),
-        residual_m=None if fit is None else known(math.hypot(*fit.fit.scale[[0, windows]].tolist())),
-        turn_unexplained=known(turn_unexplained),
-        turn_unexplained_std=known(turn_unexplained_std),
+        residual_m=None if fit is None else finite_or_none(math.hypot(*fit.fit.scale[[0, windows]].tolist())),
+        turn_unexplained=finite_or_none(turn_unexplained),
+        turn_unexplained_std=finite_or_none(turn_unexplained_std),
         ground_change_s=None if change is None else change.times_s[0],
         ground_stretches=() if change is None else change.stretches,
     )

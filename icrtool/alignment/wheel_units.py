@@ -133,7 +133,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     )
     kept = tuple(np.intersect1d(restarts, stamps).tolist())
     samples = WheelSamples(stamps, left, right, from_position=wheels.from_position, restarts_ns=kept)
-    return replace(log, wheels=samples, streams=streams, notes=(*log.notes, *about(log.name, notes)))
+    return replace(log, wheels=samples, streams=streams, notes=(*log.notes, *notes_about(log.name, notes)))
 
 
 def with_right_size(log: RobotLog, config: Config) -> tuple[RobotLog, float]:

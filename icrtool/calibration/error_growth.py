@@ -152,7 +152,7 @@ def _from_squares(heading: Floats, size: Floats, square: Floats) -> Spread:
     return Spread(heading, (size + square.real) / 2, square.imag / 2, (size - square.real) / 2)
 
 
-def radius(spread: Spread, share: float) -> Floats:
+def radius_of_share(spread: Spread, share: float) -> Floats:
     """Return the radius (w,) [m] that holds a share of the errors, normal with the moments (w, 1); bisection."""
     across = _directions(spread)
     low, high = np.zeros(len(across)), 6.0 * np.sqrt(across.max(axis=1))
@@ -193,10 +193,10 @@ def fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats
             scaled = weight * columns[rows]
             matrix += scaled.T @ scaled / np.count_nonzero(rows)
             y += scaled.T @ (weight * (squared[rows] - of_parameters[rows, 0])) / np.count_nonzero(rows)
-    return nonnegative(matrix, y)
+    return solve_nonnegative(matrix, y)
 
 
-def nonnegative(matrix: Floats, y: Floats) -> Floats:
+def solve_nonnegative(matrix: Floats, y: Floats) -> Floats:
     """Return x >= 0 (n,) that minimises x matrix x / 2 - y x; matrix is positive semidefinite, n is small.
 
     Notes
@@ -338,4 +338,4 @@ def forecast_errors(calibration: Calibration, windows: Windows, *, with_gyro: bo
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
     found = path_errors(windows, fitted, calibration.width_m)
     spread = found.of_sources.combined(np.array(astuple(sources)[:SOURCES])).plus(found.of_parameters)
-    return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius(spread, 0.95)
+    return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius_of_share(spread, 0.95)

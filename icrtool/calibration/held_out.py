@@ -39,7 +39,7 @@ from icrtool.motion.recording import (
 from icrtool.motion.window_fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.records.acceptance import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.calibration_document import ControllerErrors, ErrorSources
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 
 HELD_OUT_HORIZONS_M = (5.0, 10.0, 20.0)
 
@@ -372,7 +372,7 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     spread, far = sources.combined(variances).plus(stated), length >= SCALED_FROM_M
     error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
     level = min(95.0 * (1.0 + 1.0 / count), 100.0)
-    share = np.percentile(error / np.maximum(error_growth.radius(spread, 0.95)[far], 1e-9), level)
+    share = np.percentile(error / np.maximum(error_growth.radius_of_share(spread, 0.95)[far], 1e-9), level)
     mean = error.mean() / max(float(error_growth.mean_error(spread)[far].mean()), 1e-9)
     # ratio of measured to normal error: with fewer stretches it is drawn closer to 1
     factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
@@ -403,8 +403,8 @@ def measure_controller_errors(table: HeldOut, *, has_gyro: bool) -> ControllerEr
         twist_variance=_variances(velocities),
         turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
         way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
-        p95_m=known(float(table.score(CONTROLLER).together.p95[h])),
-        full_p95_m=known(float(table.score(RECOMMENDED).together.p95[h])),
+        p95_m=finite_or_none(float(table.score(CONTROLLER).together.p95[h])),
+        full_p95_m=finite_or_none(float(table.score(RECOMMENDED).together.p95[h])),
         twist_variance_std=_variance_stds(velocities, stretches),
         gyro_rate_variance=turn_rate,
         gyro_rate_variance_std=turn_rate_std,
@@ -426,7 +426,9 @@ def _variance_stds(errors: Floats, stretches: int) -> tuple[float, float, float]
 def _shares(missed: Floats, first: Floats, second: Floats) -> tuple[float, float]:
     """Return a, b >= 0 such that a first^2 + b second^2 fits missed^2 by least squares."""
     columns = np.column_stack([first**2, second**2])
-    a, b = np.maximum(error_growth.nonnegative(columns.T @ columns, columns.T @ missed**2), SMALLEST_VARIANCE).tolist()
+    a, b = np.maximum(
+        error_growth.solve_nonnegative(columns.T @ columns, columns.T @ missed**2), SMALLEST_VARIANCE
+    ).tolist()
     return a, b
 
 

@@ -35,7 +35,7 @@ from icrtool.motion.robot_prior import prior_of_model
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.notes import Note, is_grave, note
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.run import WarmStart
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument
 from icrtool.records.tables import RobotLog
@@ -245,7 +245,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
 
     def summary(self) -> dict[str, Any]:
         """Return what the calibration file holds, as plain data."""
-        found: dict[str, Any] = plain(msgspec.structs.replace(self, name=UNSET))
+        found: dict[str, Any] = plain_value(msgspec.structs.replace(self, name=UNSET))
         return found
 
 

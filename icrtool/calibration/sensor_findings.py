@@ -20,7 +20,7 @@ from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
 from icrtool.records import calibration_document as documents
 from icrtool.records.measurements import RESPONSE_S, Finding
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run import Run
 
 
@@ -141,7 +141,7 @@ def _numbers(finding: Finding | documents.SensorParameter) -> tuple[float, float
 
 
 def _parameter(value: float, std: float, verdict: documents.SensorVerdict, note: str = "") -> documents.SensorParameter:
-    return documents.SensorParameter(known(value), known(std), verdict, note)
+    return documents.SensorParameter(finite_or_none(value), finite_or_none(std), verdict, note)
 
 
 def _reason(key: str, driven: documents.SensorDrive) -> str:

@@ -26,7 +26,7 @@ from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Recording, cut_trials
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.rows import FITTED_SPREAD
 from icrtool.records.run import Run
 from icrtool.records.text import with_interval, with_std
@@ -166,7 +166,7 @@ def _sum_up(
     sums = statistics.block_sums(errors_m, blocks, ranked, p50, p95)
     found = statistics.error_intervals(errors_m, blocks, sums, p50, p95, FITTED_SPREAD)
     numbers = (p95, found.p95_low, found.p95_high, expected, found.expected_low, found.expected_high)
-    return documents.ErrorsAt(horizon_m, *map(known, numbers)), sums
+    return documents.ErrorsAt(horizon_m, *map(finite_or_none, numbers)), sums
 
 
 def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[documents.ErrorsAt]:
@@ -186,7 +186,7 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[docum
             then, now = getattr(before, name), getattr(after, name)
             more = math.nan if then is None or now is None else now - then
             half = statistics.difference_half_width(new, old, metric, 1.0, paired=paired)
-            numbers += [known(more), known(more - half), known(more + half)]
+            numbers += [finite_or_none(more), finite_or_none(more - half), finite_or_none(more + half)]
         found.append(documents.ErrorsAt(horizon, *numbers))
     return found
 

@@ -86,11 +86,11 @@ def _run() -> int:
         except (IcrToolError, OSError) as err:
             if isinstance(err, OSError) and err.filename is None:
                 raise
-            from icrtool.cli.printing import error
+            from icrtool.cli.printing import print_error
             from icrtool.records.text import LogText
 
             # A path that is too long, or on a disk that fails, where no command knows more about it.
-            error(f"{LogText(str(err.filename))}: {err.strerror}" if isinstance(err, OSError) else str(err))
+            print_error(f"{LogText(str(err.filename))}: {err.strerror}" if isinstance(err, OSError) else str(err))
             return 1
         except (MemoryError, ImportError, SystemError) as err:
             # without memory, a library or a module may be loaded in part only

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from icrtool.cli import options, when_used
 from icrtool.cli.options import LOG, PLACE, POSITIVE, Exports, flag, option
-from icrtool.cli.printing import LiveLine, Printer, error
+from icrtool.cli.printing import LiveLine, Printer, print_error
 from icrtool.records.text import LogText, counted, escaped, shortened
 
 with when_used():
@@ -45,7 +45,7 @@ class Workers(NamedTuple):
     worker_timeout_s: float = 60.0
 
 
-WORKERS = options.together(
+WORKERS = options.options_as_record(
     "workers",
     Workers,
     option("-j --jobs", "N", click.IntRange(min=1), "Logs at the same time; default: one per core, fewer where memory "
@@ -56,12 +56,12 @@ WORKERS = options.together(
 )  # fmt: skip
 
 
-BATCH = options.together(
+BATCH = options.options_as_record(
     "batch",
     f"{options.REQUESTS_MODULE}:BatchRequest",
     option("--timeout timeout_s", "SECONDS", POSITIVE, "Stop a log that takes longer.", default=1800.0),
     flag("--redo", "Also process logs that are done."),
-    options.reporting(flag("--overwrite", "Also replace runs of other recordings.")),
+    options.report_options(flag("--overwrite", "Also replace runs of other recordings.")),
     options.CONFIGURATION,
     options.INPUT_LIMITS,
 )
@@ -73,7 +73,7 @@ BATCH = options.together(
         required=True)  # fmt: skip
 @WORKERS
 @BATCH
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def batch_command(
     places: tuple[Path, ...], output: Path, workers: Workers, batch: BatchRequest, exports: Exports, printer: Printer
 ) -> None:
@@ -184,7 +184,7 @@ class View(LiveLine):
             if row.status != "failed":
                 self._printer.text(line_of(row))
             elif not self._printer.quiet:
-                error(f"{escaped(row.log)}: {escaped(row.reason)}")
+                print_error(f"{escaped(row.log)}: {escaped(row.reason)}")
                 if row.details:
                     self._printer.detail("\n".join(map(escaped, row.details.splitlines())))
             for verdict in row.verdicts:

@@ -39,7 +39,7 @@ LARGEST_PLAN_BYTES = 50_000_000
 @options.ALLOW_UNUSABLE
 @options.CONFIGURATION
 @options.INPUT_LIMITS
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def calibrate_command(
     sources: tuple[str, ...],
     output: Path | None,
@@ -123,7 +123,7 @@ def _draw_residuals(source: Path, run: Run, plot: Path) -> None:
 @options.BUDGETS
 @option("-o --output", "FILE.csv", NEW_FILE, "Write a row for each metre.")
 @option("--plot", "FILE", NEW_PICTURE, "Draw the errors: png, svg, pdf.")
-@options.printing(options.AS_JSON, options.QUIET_RESULTS)
+@options.printer_options(options.AS_JSON, options.QUIET_RESULTS)
 def forecast_command(
     calibration_file: Path,
     path: Path,

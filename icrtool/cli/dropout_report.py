@@ -39,17 +39,17 @@ EPILOG_GATE = (
 )
 
 
-def distances(text: str) -> tuple[float, ...]:
+def read_horizons(text: str) -> tuple[float, ...]:
     """Read the distances [m] of ``--horizons``."""
-    metres = options.numbers("M,M,...")(text)
+    metres = options.numbers_reader("M,M,...")(text)
     if min(metres) <= 0:
         raise click.BadParameter(f"{text!r} has a distance that is not above zero")
     return metres
 
 
-REPORT_OPTIONS = options.reporting(
+REPORT_OPTIONS = options.report_options(
     options.PLACES,
-    option("--horizons horizons_m", "M,M,...", distances, "Distances without GNSS [m], in place of the configured "
+    option("--horizons horizons_m", "M,M,...", read_horizons, "Distances without GNSS [m], in place of the configured "
            "ones."),
     option("--score", "TOPIC", None, "Also compare the poses of a topic with the reference, for example "
            "/odometry/filtered; needs the LOG, which is read again; repeatable.", multiple=True),
@@ -73,7 +73,7 @@ REPORT_OPTIONS = options.reporting(
 @REPORT_OPTIONS
 @options.CONFIGURATION
 @options.INPUT_LIMITS
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def dropout_report_command(
     sources: tuple[Path, ...], place: ResultPlace, calibrations: tuple[Path, ...], report: ReportRequest,
     files: ResultFiles, baseline: Path | None, exports: Exports, settings: ConfigSources, printer: Printer,

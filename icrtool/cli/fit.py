@@ -14,7 +14,7 @@ import click
 from icrtool.cli import options, when_used
 from icrtool.cli.inputs import ResultPlace, logs_of, run_directories
 from icrtool.cli.options import PLACE, choice, flag, option
-from icrtool.cli.printing import Inputs, Printer, error
+from icrtool.cli.printing import Inputs, Printer, print_error
 from icrtool.records.choices import StatesFormat
 from icrtool.records.places import Place, UrlPath, path_of
 from icrtool.records.text import LogText, escaped
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MOST_WARNINGS = 2
 """Number of warnings that `icrtool fit` prints below its results; -v prints all."""
 
-REQUEST = options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", options.together(
+REQUEST = options.options_as_record("request", f"{options.REQUESTS_MODULE}:FitRequest", options.options_as_record(
     "files",
     f"{options.REQUESTS_MODULE}:ResultFiles",
     options.PLACES,
@@ -47,8 +47,8 @@ REQUEST = options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", o
     options.FIGURES_OPTION,
     option("--warm-start", "RUN|CAL.json", PLACE, "Start from another run's final ICRs and covariance, or from those "
            "of a calibration."),
-    option("--terrain-change changes_s", "T", lambda text: options.numbers("T, finite seconds", 1)(text)[0], "The "
-           "ground changes after T seconds: inflate the ICR covariance there; repeatable.", multiple=True),
+    option("--terrain-change changes_s", "T", lambda text: options.numbers_reader("T, finite seconds", 1)(text)[0],
+           "The ground changes after T seconds: inflate the ICR covariance there; repeatable.", multiple=True),
     flag("--smooth", "Also write the RTS smoother's states (smoothed.csv)."),
     options.CUT,
 ))  # fmt: skip
@@ -60,7 +60,7 @@ REQUEST = options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", o
 @flag("--strict", "Exit with status 3 where a run must not be used.")
 @options.CONFIGURATION
 @options.INPUT_LIMITS
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def fit_command(
     logs: tuple[Path, ...], place: ResultPlace, warm_start: Path | None, request: FitRequest, files: ResultFiles,
     strict: bool, settings: ConfigSources, printer: Printer,
@@ -84,11 +84,13 @@ def fit_command(
                 pass
             all_usable = all_usable and run.usable
             if strict and not (run.usable or printer.shows):
-                error(f"{run.name}: do not use this run: {run.document.unusable_because}")
+                print_error(f"{run.name}: do not use this run: {run.document.unusable_because}")
             where = escaped(str(path_of(run_place)))
             document |= {"directory": where, "run": run.summary}
             # The command that states what is wrong with the log.
-            examine = shlex.join(["icrtool", "info", escaped(str(log)), "-v", *options.given(settings, request)])
+            examine = shlex.join(
+                ["icrtool", "info", escaped(str(log)), "-v", *options.options_to_repeat(settings, request)]
+            )
             printer.show([*run_tables.run_blocks(run.document), *run_tables.next_blocks(run.document, where, examine)])
             printer.warn_of(run, most=MOST_WARNINGS)
     printer.json("fit", {"logs": inputs.documents})
@@ -132,10 +134,10 @@ def fitted_log(
 
 @click.command("info")
 @options.LOGS
-@options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", options.CUT)
+@options.options_as_record("request", f"{options.REQUESTS_MODULE}:FitRequest", options.CUT)
 @options.CONFIGURATION
 @options.INPUT_LIMITS
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSources, printer: Printer) -> None:
     """List what each log holds, which topics are used for wheels, position and heading, and the problems found.
 
@@ -144,7 +146,7 @@ def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSo
 
     Exit status 1 when `icrtool fit` could not run on a log.
     """
-    config, given = settings.load(), options.given(settings, request)
+    config, given = settings.load(), options.options_to_repeat(settings, request)
     inputs = Inputs("log")
     for log in logs_of(logs, printer):
         with inputs.each(log) as document:
@@ -193,9 +195,9 @@ def _examine(
         document.update(
             {
                 "reason": None,
-                **(plain_data.plain(holds) if holds is not None else {}),
-                "streams": plain_data.plain(measured.streams) if measured is not None else [],
-                "notes": plain_data.plain(findings),
+                **(plain_data.plain_value(holds) if holds is not None else {}),
+                "streams": plain_data.plain_value(measured.streams) if measured is not None else [],
+                "notes": plain_data.plain_value(findings),
                 "warnings": list(warnings),
                 "verdict": overview.verdict(run, problem, names),
                 "next": command,

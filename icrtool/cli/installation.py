@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @click.command("robots")
-@options.printing(options.AS_JSON)
+@options.printer_options(options.AS_JSON)
 def robots_command(printer: Printer) -> None:
     """List the built-in robots for --robot, with their numbers and sources.
 
@@ -75,7 +75,7 @@ def cache_command() -> None:
 
 @cache_command.command("warm")
 @flag("-q --quiet", "Print no result.")
-def warm(*, quiet: bool) -> None:
+def compile_all(*, quiet: bool) -> None:
     """Compile all kernels and modules now, so that no later command waits for it: for an image or a CI cache.
 
     The kernels' code is kept in NUMBA_CACHE_DIR; without it, next to the installed package, or else in the user's
@@ -112,7 +112,7 @@ def call_all_kernels() -> None:
     import numpy as np
 
     import icrtool
-    from icrtool.estimation.run_filter import smooth
+    from icrtool.estimation.run_filter import smooth_run
     from icrtool.kernels.open_loop import open_loop_errors_direct
     from icrtool.kernels.track import FrozenIcrs, trial_ends
     from icrtool.logs.write_log import WriteOptions, write_log
@@ -133,7 +133,7 @@ def call_all_kernels() -> None:
         log = icrtool.read_log(write_log(Path(folder) / "drive.mcap", columns, writing), config)
     run = icrtool.fit(log, config)
     icrtool.dropout(run)
-    smooth(run)
+    smooth_run(run)
     track = track_of(run)
     open_loop_errors_direct(track, FrozenIcrs.constant(0.4, -0.4, 0.0), trial_ends(track, np.array([1.0])))
     request = default_request("consistency", config)

@@ -1,7 +1,7 @@
 """Options that several commands share, and the functions that read their values.
 
 Each option is declared by `option`, `choice` or `flag`. Options that belong together reach the command as one argument
-(`together`).
+(`options_as_record`).
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def flag(names: str, text: str, **further: Any) -> Option:
     return click.option(*names.split(), is_flag=True, help=text, **further)
 
 
-def together(name: str, home: str | Callable[..., Any], *options: Option, change: bool = False) -> Option:
+def options_as_record(name: str, home: str | Callable[..., Any], *options: Option, change: bool = False) -> Option:
     """Return a decorator that adds options to a command, in this order, and passes a record of them as one argument.
 
     Parameters
@@ -207,7 +207,7 @@ FILE, NEW_FILE = _Path(), _Path(check="icrtool.output.files.atomic:check_place")
 NEW_PICTURE = _Path(check="icrtool.output.files.formats:check_picture")
 
 
-def numbers(form: str, count: int | None = None) -> Callable[[str], tuple[float, ...]]:
+def numbers_reader(form: str, count: int | None = None) -> Callable[[str], tuple[float, ...]]:
     """Return a function that reads numbers separated by commas; `form` is their form, for the error message."""
 
     def read(text: str) -> tuple[float, ...]:
@@ -280,7 +280,7 @@ def _limit(variable: str, read: str) -> Callable[[click.Context, click.Parameter
             value = getattr(input_limits, read)(text)
         except ValueError as err:
             raise click.BadParameter(str(err)) from None
-        context.with_resource(input_limits.limited(getattr(input_limits, variable), value))
+        context.with_resource(input_limits.set_limit(getattr(input_limits, variable), value))
 
     return set_limit
 
@@ -295,7 +295,7 @@ INPUT_LIMITS = add_all(
 )  # fmt: skip
 """--most-bytes and --server-timeout, which hold while the command runs, and in the processes that it starts."""
 
-CONFIGURATION = together(
+CONFIGURATION = options_as_record(
     "settings",
     "icrtool.config:ConfigSources",
     option("--config file", "FILE.toml", FILE, "Configuration file."),
@@ -307,7 +307,7 @@ CONFIGURATION = together(
 """--config, --robot and --set, as `settings`."""
 
 
-PLACES = together(
+PLACES = options_as_record(
     "place",
     ResultPlace,
     option("-o --output", "DIR", PLACE, "Run directory of the log; with several logs: the folder of their run "
@@ -331,9 +331,9 @@ QUIET = flag("-q --quiet", "Print no results and no warnings.")
 VERBOSE_OPTION = flag("-v --verbose", "Print more details.")
 
 
-def printing(*options: Option) -> Option:
+def printer_options(*options: Option) -> Option:
     """Add some of the options above, as `printer`."""
-    return together("printer", Printer, *options)
+    return options_as_record("printer", Printer, *options)
 
 
 SEED = option("--seed", None, click.IntRange(min=0), "Seed of all noise; the same seed, the same numbers.", default=0)
@@ -369,7 +369,7 @@ CALIBRATION_OPTIONS = add_all(
 ALLOW_UNUSABLE = flag("--allow-unusable", "Give distances and numbers of runs that are not usable, too.")
 
 
-def _lines(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:
+def _split_gates(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:
     """Return the limits, one per line of each text. A blank text is kept, so that it is refused as an invalid limit."""
     lines = tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
     for line in lines:
@@ -398,16 +398,16 @@ class Exports(NamedTuple):
             atomic.write_file(self.markdown, text())
 
 
-def reporting(*further: Option) -> Option:
+def report_options(*further: Option) -> Option:
     """Add the options of a report as `report`, `files`, `exports` and `baseline`; `further`: options of one command."""
-    return together("exports", Exports, together("files", f"{REQUESTS_MODULE}:ResultFiles", together(
+    of_report = options_as_record(
         "report",
         f"{REQUESTS_MODULE}:ReportRequest",
         *further,
         CALIBRATION_OPTIONS,
         BUDGETS,
         option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one a line: exit status 3 if one is not "
-               "met; repeatable.", multiple=True, callback=_lines),
+               "met; repeatable.", multiple=True, callback=_split_gates),
         option("--baseline", "REPORT.json|DIR", FILE, "Earlier report, run or batch to compare with; a limit may then "
                "read \"icr.p95@10m <= 1.1 * baseline\"."),
         flag("--strict-gates", "Compare limits relative to the baseline by their number alone, without the "
@@ -421,7 +421,9 @@ def reporting(*further: Option) -> Option:
         FIGURES_OPTION,
         flag("--page/--no-page", "Also write report.html: pictures, tables and an interactive map in one file.",
              default=True, show_default=True),
-    )))  # fmt: skip
+    )  # fmt: skip
+    files = options_as_record("files", f"{REQUESTS_MODULE}:ResultFiles", of_report)
+    return options_as_record("exports", Exports, files)
 
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.Baseline | None:
@@ -455,7 +457,7 @@ def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
         raise errors.ConfigError("--baseline", "none of these logs is in it", advice)
 
 
-def given(settings: ConfigSources, request: FitRequest) -> list[str]:
+def options_to_repeat(settings: ConfigSources, request: FitRequest) -> list[str]:
     """Return the options of this call that the next command needs too."""
     pairs = [("--config", settings.file), ("--robot", settings.robot), *(("--set", one) for one in settings.sets)]
     pairs += [("--from", request.start), ("--to", request.end)]

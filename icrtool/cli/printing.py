@@ -17,7 +17,7 @@ import click
 
 from icrtool import __version__
 from icrtool.cli import when_used
-from icrtool.output.text_blocks import Block, Line, Table, fitted_to, format_blocks, printed
+from icrtool.output.text_blocks import Block, Line, Table, fitted_to, format_blocks, printed_parts
 from icrtool.records.text import LONGEST_NAME, counted, escaped, listed, shortened
 
 with when_used():
@@ -46,7 +46,7 @@ FEWEST_COLUMNS = 3
 TEXT_STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
 
 
-def show(blocks: Iterable[Block], *, verbose: bool) -> None:
+def print_document(blocks: Iterable[Block], *, verbose: bool) -> None:
     """Print a document. ``NO_COLOR`` and ``TERM=dumb`` are respected; nothing in its text is read as markup."""
     if not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
         click.echo(format_blocks(blocks, verbose=verbose))
@@ -56,7 +56,7 @@ def show(blocks: Iterable[Block], *, verbose: bool) -> None:
 
     console = Console(force_terminal=True, highlight=False, markup=False, emoji=False)
     console.width = min(console.width, WIDEST)
-    for block in printed(blocks, verbose=verbose):
+    for block in printed_parts(blocks, verbose=verbose):
         if isinstance(block, Table):
             _print_table(block, console)
         elif isinstance(block, Line):
@@ -102,7 +102,7 @@ def signal_word(word: str, color: str) -> str:
     return click.style(word, fg=color, bold=True) if wanted else word
 
 
-def error(text: str) -> None:
+def print_error(text: str) -> None:
     """Print the line about an error on standard error."""
     click.echo(f"{signal_word('Error:', 'red')} {text}", err=True)
 
@@ -122,7 +122,7 @@ class Printer(NamedTuple):
     def show(self, blocks: Iterable[Block]) -> None:
         """Print a document as text, with -v all of it."""
         if self.shows:
-            show(blocks, verbose=self.verbose)
+            print_document(blocks, verbose=self.verbose)
 
     def text(self, text: str) -> None:
         """Print a result that is text already."""
@@ -140,7 +140,7 @@ class Printer(NamedTuple):
         if not self.as_json:
             return
         own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
-        content = own | {key: value for key, value in plain_data.plain(document).items() if key not in own}
+        content = own | {key: value for key, value in plain_data.plain_value(document).items() if key not in own}
         click.echo(formats.json_bytes(content), nl=False)
 
     def detail(self, text: str) -> None:
@@ -210,13 +210,13 @@ class Inputs:
             self.errors[str(source)] = err
             name = shortened(escaped(str(source)), LONGEST_NAME)
             named = any(part in str(err) for part in (name, escaped(source.name), escaped(source.stem)))
-            error(str(err) if named else f"{name}: {err}")
+            print_error(str(err) if named else f"{name}: {err}")
 
     def leave(self, what: str, *, gate_failed: bool = False) -> None:
         """Exit with status 3 if an acceptance limit was not met, else 1 if an input, a `what`, could not be used."""
         failed = [shortened(escaped(source), LONGEST_NAME) for source in self.errors]
         if failed and len(self.documents) > 1:
-            error(f"{len(failed)} of {len(self.documents)} {what} could not be used: {listed(failed, 5)}")
+            print_error(f"{len(failed)} of {len(self.documents)} {what} could not be used: {listed(failed, 5)}")
         if gate_failed or failed:
             raise SystemExit(3 if gate_failed else 1)
 

@@ -46,10 +46,10 @@ if TYPE_CHECKING:
 @flag("--no-coordinates", "Leave out the place on the globe, for a page that others will read.")
 @option("--into", "DIR", FILE, "Folder of the run directories of logs; default: icrtool-runs.")
 @flag("--overwrite", "Also replace the run of another recording, or one that was made with other settings.")
-@options.together("report", f"{options.REQUESTS_MODULE}:ReportRequest", options.CALIBRATION_OPTIONS)
+@options.options_as_record("report", f"{options.REQUESTS_MODULE}:ReportRequest", options.CALIBRATION_OPTIONS)
 @options.CONFIGURATION
 @options.INPUT_LIMITS
-@options.printing(options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.QUIET, options.VERBOSE_OPTION)
 def report_command(
     sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, into: Path | None, overwrite: bool,
     calibrations: tuple[Path, ...], report: requests.ReportRequest, settings: ConfigSources, printer: Printer,
@@ -177,7 +177,7 @@ def _as_written(place: Path, advice: str) -> Iterator[None]:
 @option("--plot", "FILE", NEW_PICTURE, "Draw the comparison: png, svg, pdf.")
 @options.CONFIGURATION
 @options.INPUT_LIMITS
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def compare_command(
     sources: tuple[str, ...],
     csv: Path | None,

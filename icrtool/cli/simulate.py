@@ -12,7 +12,18 @@ import click
 
 from icrtool.cli import options, when_used
 from icrtool.cli.inputs import RUNS_FOLDER
-from icrtool.cli.options import FILE, NOT_NEGATIVE, POSITIVE, Change, Option, choice, flag, numbers, option, together
+from icrtool.cli.options import (
+    FILE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Change,
+    Option,
+    choice,
+    flag,
+    numbers_reader,
+    option,
+    options_as_record,
+)
 from icrtool.cli.printing import Printer
 from icrtool.records.choices import HeadingConvention, PathKind, PresetName, StudyName, WheelMessages
 
@@ -46,12 +57,12 @@ PAPER_COUNTS = 8192.0
 def change_text(text: str) -> tuple[float, tuple[float, ...]]:
     """Read ``T:YR,YL,X``."""
     time, _, icrs = text.partition(":")
-    return numbers("T:YR,YL,X", 1)(time)[0], numbers("T:YR,YL,X", 3)(icrs)
+    return numbers_reader("T:YR,YL,X", 1)(time)[0], numbers_reader("T:YR,YL,X", 3)(icrs)
 
 
 def span_text(text: str) -> tuple[float, ...]:
     """Read ``BEGIN:END``."""
-    span = numbers("BEGIN:END", 2)(text.replace(":", ",", 1) if ":" in text else "")
+    span = numbers_reader("BEGIN:END", 2)(text.replace(":", ",", 1) if ":" in text else "")
     if span[1] <= span[0]:
         raise click.BadParameter(f"{text!r} ends before it begins")
     return span
@@ -61,7 +72,7 @@ def gnss_text(text: str) -> float:
     """Read ``rtk``, ``waas`` or metres."""
     if text in GNSS_NOISE_M:
         return GNSS_NOISE_M[text]
-    metres = numbers("rtk, waas or METRES", 1)(text)[0]
+    metres = numbers_reader("rtk, waas or METRES", 1)(text)[0]
     if metres < 0:
         raise click.BadParameter(f"{text!r} is a negative noise")
     return metres
@@ -75,7 +86,7 @@ def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) ->
         raise click.BadParameter(why, param_hint="--change")
 
 
-def degrees(within: click.FloatRange | None = None) -> Callable[[Any], float]:
+def angle_reader(within: click.FloatRange | None = None) -> Callable[[Any], float]:
     """Return what reads an angle in degrees, of a range where one is given, and gives radians."""
 
     def radians(text: Any) -> float:  # noqa: ANN401 - what click has: a text, or the default
@@ -88,7 +99,7 @@ DRIVE = (
     (
         "--icrs icrs_m",
         "YR,YL,X",
-        numbers("YR,YL,X", 3),
+        numbers_reader("YR,YL,X", 3),
         "True ICRs [m]; default: by the robot's width, or the study's.",
     ),
     ("--path kind", None, click.Choice(get_args(PathKind)), "Path to drive; study convergence then has no other."),
@@ -120,22 +131,22 @@ DYNAMICS = (
 """Options of `simulate` and `study` for a robot on sliding contacts."""
 
 RECORDED = (
-    ("--start-heading start_heading_rad", "DEG", degrees(), "Heading at the start, clockwise from north.", 30.0),
+    ("--start-heading start_heading_rad", "DEG", angle_reader(), "Heading at the start, clockwise from north.", 30.0),
     ("--wheels", None, click.Choice(["encoder", "commanded"]),
      "Content of the wheel messages: counted travel, or the motor commands.", "encoder"),
     ("--wheel-messages", None, click.Choice(get_args(WheelMessages)), "Message type of the wheels.", "joint_states"),
     ("--wheel-rate", "HZ", POSITIVE, "Wheel messages a second; default 100, commanded 10.", None),
     ("--motor-lag motor_lag_s", "S", NOT_NEGATIVE, "Time constant with which the tracks follow their commands.", 0.0),
-    ("--antenna", "FORWARD,RIGHT", numbers("FORWARD,RIGHT", 2), "Position of the antenna, from the body origin [m].",
-     "0,0"),
+    ("--antenna", "FORWARD,RIGHT", numbers_reader("FORWARD,RIGHT", 2),
+     "Position of the antenna, from the body origin [m].", "0,0"),
     ("--gnss-delay gnss_delay_s", "S", float, "The stamps of the fixes lag by this.", 0.0),
     ("--heading convention", None, click.Choice(get_args(HeadingConvention)),
      "Convention of the Imu: REP-103, or REP-145's NED.", "enu"),
-    ("--heading-std heading_std_rad", "DEG", degrees(NOT_NEGATIVE), "White noise of the heading.", 1.0),
-    ("--heading-resolution heading_resolution_rad", "DEG", degrees(NOT_NEGATIVE), "Headings are rounded to this.",
+    ("--heading-std heading_std_rad", "DEG", angle_reader(NOT_NEGATIVE), "White noise of the heading.", 1.0),
+    ("--heading-resolution heading_resolution_rad", "DEG", angle_reader(NOT_NEGATIVE), "Headings are rounded to this.",
      0.05),
     ("--heading-rate heading_rate_hz", "HZ", POSITIVE, "Headings a second.", 100.0),
-    ("--heading-offset heading_offset_rad", "DEG", degrees(), "Added to every heading, clockwise.", 0.0),
+    ("--heading-offset heading_offset_rad", "DEG", angle_reader(), "Added to every heading, clockwise.", 0.0),
     ("--heading-delay heading_delay_s", "S", float, "The stamps of the headings lag by this.", 0.0),
 )  # fmt: skip
 """Further options of `simulate`, as in `DRIVE`, with their default."""
@@ -151,11 +162,11 @@ def drive_options(*further: Option, **defaults: object) -> Option:
     text = "The ICRs become these after T seconds; repeatable."
     change = option("--change changes", "T:YR,YL,X", change_text, text, multiple=True)
     of_drive = [option(*row, default=defaults.get(row[0].split()[-1])) for row in DRIVE]
-    of_robot = together("contacts", "icrtool.simulation.friction:FrictionRobot", *DYNAMICS, change=True)
+    of_robot = options_as_record("contacts", "icrtool.simulation.friction:FrictionRobot", *DYNAMICS, change=True)
     options_of_sensors = (*of_drive, change, of_robot, *further)
-    of_sensors = together("sensors", "icrtool.simulation.drives:Sensors", *options_of_sensors, change=True)
-    of_plan = together("plan", "icrtool.simulation.drives:DrivePlan", of_sensors, change=True)
-    return together("path", "icrtool.simulation.drives:PathPlan", of_plan, change=True)
+    of_sensors = options_as_record("sensors", "icrtool.simulation.drives:Sensors", *options_of_sensors, change=True)
+    of_plan = options_as_record("plan", "icrtool.simulation.drives:DrivePlan", of_sensors, change=True)
+    return options_as_record("path", "icrtool.simulation.drives:PathPlan", of_plan, change=True)
 
 
 @options.command("simulate")
@@ -169,7 +180,7 @@ def drive_options(*further: Option, **defaults: object) -> Option:
     **DRIVE_DEFAULTS,
 )
 @options.CONFIGURATION
-@options.printing(options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.QUIET, options.VERBOSE_OPTION)
 def simulate_command(
     log: Path, force: bool, seed: int, speeds: Path | None, path: Change[PathPlan], plan: Change[DrivePlan],
     sensors: Change[Sensors], encoder_counts: float | None, wheel_rate: float | None, antenna: tuple[float, float],
@@ -198,7 +209,7 @@ def simulate_command(
     drive = replace(drive, robot=friction_robot(contacts, config, dynamics=dynamics, tracks=tracks))
     check_changes(drive.changes, drive.duration_s)
     counts = encoder_counts or config.robot.encoder_counts_per_rev or PAPER_COUNTS
-    radius_m = needed(config, "wheel_radius_m")
+    radius_m = needed_number(config, "wheel_radius_m")
     metres = 2 * math.pi * radius_m / counts
     sensors_given = drives.Sensors(metres_per_count=metres, antenna_forward_m=antenna[0], antenna_right_m=antenna[1])
     sensed = sensors(sensors_given)
@@ -214,7 +225,7 @@ def simulate_command(
         wheels=wheel_messages,
         heading=convention,
         wheel_radius_m=radius_m,
-        track_width_m=needed(config, "track_width_m"),
+        track_width_m=needed_number(config, "track_width_m"),
         counts_per_rev=counts,
         heading_std_deg=math.degrees(sensed.heading_std_rad),
     )
@@ -242,11 +253,11 @@ def friction_robot(
 
 def default_icrs(config: Config) -> Icrs:
     """Return the true ICRs where none are given."""
-    half = DEFAULT_MULTIPLIER * needed(config, "track_width_m") / 2
+    half = DEFAULT_MULTIPLIER * needed_number(config, "track_width_m") / 2
     return half, -half, 0.0
 
 
-def needed(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> float:
+def needed_number(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> float:
     """Return a number of the robot that a simulation cannot do without."""
     value: float | None = getattr(config.robot, key)
     if value is None:
@@ -264,7 +275,7 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
         right, left, x = (float(truth[name].mean()) for name in runs.ICR_COLUMNS)
     what = f"{plan.path.kind} path" if isinstance(plan.path, drives.PathPlan) else "track speeds as given"
     lines = [
-        f"robot  {config.robot.name or 'as configured'}, b = {needed(config, 'track_width_m'):g} m",
+        f"robot  {config.robot.name or 'as configured'}, b = {needed_number(config, 'track_width_m'):g} m",
         f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {seed}",
         f"ICRs   y right {right:+z.3f}, y left {left:+z.3f}, x {x:+z.3f} m{', mean' if plan.robot else ''}",
     ]
@@ -275,12 +286,14 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
 @options.command("study")
 @click.argument("name", metavar="NAME", type=click.Choice(get_args(StudyName)))
 @option("-o --output", "DIR", FILE, "Study directory; default icrtool-runs/study-NAME.")
-@together(
+@options_as_record(
     "request",
     "icrtool.simulation.study_records:StudyRequest",
     option("--runs", "N", click.IntRange(min=1), "Runs for each value (in study initial: for each start)."),
     options.SEED,
-    option("--values", "V,V,...", numbers("V,V,..."), "Values of the quantity that the study varies, in its unit."),
+    option(
+        "--values", "V,V,...", numbers_reader("V,V,..."), "Values of the quantity that the study varies, in its unit."
+    ),
     change=True,
 )
 @choice("--preset", get_args(PresetName), "Study this preset alone; default: both; initial: paper; convergence: paper, "
@@ -288,11 +301,11 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
 @drive_options(
     choice("--wheels", ("ideal", "encoder"), "Wheel speeds without error, or counted travel."),
     option("--rate", "HZ", click.FloatRange(min=1, max=200), "Wheel and heading samples per second."),
-    option("--heading-std heading_std_rad", "DEG", degrees(POSITIVE), "White noise of the heading."),
+    option("--heading-std heading_std_rad", "DEG", angle_reader(POSITIVE), "White noise of the heading."),
 )
 @options.PLOTS_OPTION
 @options.CONFIGURATION
-@options.printing(options.QUIET, options.VERBOSE_OPTION)
+@options.printer_options(options.QUIET, options.VERBOSE_OPTION)
 def study_command(
     name: str, output: Path | None, request: Change[StudyRequest], preset: PresetName | None,
     path: Change[PathPlan], plan: Change[DrivePlan], sensors: Change[Sensors], encoder_counts: float | None,

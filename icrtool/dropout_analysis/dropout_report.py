@@ -42,7 +42,7 @@ from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.choices import Reference, Starts
 from icrtool.records.dropout_document import TurningSplit, UsedCalibration
 from icrtool.records.notes import Note, warnings_of
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.requests import ReportRequest
 from icrtool.records.rows import TOPIC_ROW, kind_of, turned_by
 from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
@@ -504,7 +504,7 @@ def _ladder(
     table, fits = compared_models.table, {}
     for name, fit in table.fits.items():
         value, std = (dict(zip(fit.model.terms, column.tolist(), strict=True)) for column in (fit.parameters, fit.std))
-        fits[name] = documents.FitDocument(plain(value), plain(std))
+        fits[name] = documents.FitDocument(plain_value(value), plain_value(std))
     return documents.LadderDocument(
         horizons_m=errors.horizons_m.tolist(),
         blocks=len(table.folds),

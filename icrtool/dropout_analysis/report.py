@@ -34,7 +34,7 @@ from icrtool.kernels.track import TrialCounts
 from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M, DISTANCES, METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.choices import FigureSet
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.rows import TOPIC_ROW, kind_of, row_of, turned_by
 from icrtool.records.run_document import RunDocument, known_content
 from icrtool.records.text import escaped, listed
@@ -518,6 +518,6 @@ def verdict_on(gate: Gate, log: str, *, passed: bool, **found: float | str | Non
     ----------
     found : further fields of `Verdict`; a number that is not finite becomes None
     """
-    fields = {"value_m": None} | {name: plain(value) for name, value in found.items()}
+    fields = {"value_m": None} | {name: plain_value(value) for name, value in found.items()}
     checked = Verdict(*astuple(gate), passed=passed, verdict="", **fields)
     return replace(checked, verdict=checked.line(log))

@@ -20,7 +20,7 @@ from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Trials
 from icrtool.records.choices import Starts
 from icrtool.records.dropout_document import ExampleTrial, Outage, OutageDocument, PathErrors, TrialDocument
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.rows import row_of
 from icrtool.records.run import Run, track_of
 
@@ -166,7 +166,7 @@ def _example(
         if row_of(row.name).pictured and row.path is not None and (path := row.path(start, end)) is not None:
             paths[row.name] = path
     errors = {
-        name: known(float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end])))
+        name: finite_or_none(float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end])))
         for name, path in paths.items()
     }
     table = run.table
@@ -242,7 +242,7 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
             raise ConfigError("outage", what, advice)
         document = OutageDocument(
             "forced", (begin - origin) / 1e9, (end - origin) / 1e9, float(np.ptp(distance[inside])),
-            known(float(away[inside][-1])), known(float(away[inside].max())),
+            finite_or_none(float(away[inside][-1])), finite_or_none(float(away[inside].max())),
         )  # fmt: skip
         outages.append(Outage(document, north[inside], east[inside]))
     return tuple(outages)
@@ -308,7 +308,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         at, of = (fixes.stamp_ns[rows] - stamps[0]) / 1e9, (stamps - stamps[0]) / 1e9
         north = np.interp(at, of, path.north + forward * cos - right * sin) - fixes.north_m[rows]
         east = np.interp(at, of, path.east + forward * sin + right * cos) - fixes.east_m[rows]
-        error = known(float(np.hypot(north.mean(), east.mean())))
+        error = finite_or_none(float(np.hypot(north.mean(), east.mean())))
         inside = slice(last - first + 1)
         driven_m = float(table.distance_m[last] - table.distance_m[first])
         begin_s, end_s = ((int(one) - origin) / 1e9 for one in (begin, end))

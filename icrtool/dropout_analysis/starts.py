@@ -24,7 +24,7 @@ from icrtool.kernels.open_loop import open_loop_errors
 from icrtool.kernels.track import STANDING, Track, ends_from
 from icrtool.records.choices import Starts
 from icrtool.records.dropout_document import ReferenceRow, TurningSplit
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 
 STANDING_MPS = 0.01
@@ -153,7 +153,7 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
         square = sum(std**2 for std in (*north_std, *east_std))
         square = square + std_heading**2 * (north**2 + east**2)
         of_error = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
-        rows.append(ReferenceRow(one.horizon_m, *(known(float(number)) for number in of_error)))
+        rows.append(ReferenceRow(one.horizon_m, *(finite_or_none(float(number)) for number in of_error)))
     return tuple(rows)
 
 

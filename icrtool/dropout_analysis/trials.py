@@ -35,7 +35,7 @@ from icrtool.kernels.track import (
 from icrtool.motion.recording import MOST_TRIALS, TrialErrors, Trials
 from icrtool.records import dropout_document as documents
 from icrtool.records.choices import Starts
-from icrtool.records.plain_data import known, plain
+from icrtool.records.plain_data import finite_or_none, plain_value
 from icrtool.records.rows import row_of
 from icrtool.records.run import Run, track_of
 from icrtool.records.stages import Watch, unwatched
@@ -296,7 +296,7 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
 def _row(metres: float, errors: Floats) -> documents.ErrorRow:
     """Return the statistics of the errors (n,) [m] at one horizon."""
     trials, *numbers = statistics.RankedTrials.of(errors).summary()
-    return documents.ErrorRow(metres, trials, *map(known, numbers))
+    return documents.ErrorRow(metres, trials, *map(finite_or_none, numbers))
 
 
 def _blocks(path_m: Floats, horizons: Floats, tried: Iterable[Bools]) -> list[statistics.Blocks | None]:
@@ -339,7 +339,7 @@ def _at_horizon(
     _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.of(np.degrees(turned)).summary()
     shares = 100.0 * expected / metres, 100.0 * p95 / metres
     numbers = (expected, p50, p95, largest, *shares, *intervals, turn_mean, turn_p95)
-    row = documents.SummaryRow(metres, trials, *(known(float(number)) for number in numbers))
+    row = documents.SummaryRow(metres, trials, *(finite_or_none(float(number)) for number in numbers))
     free = None if slipping is None else _row(metres, errors[~slipping])
     return _AtHorizon(row, bins, sums, free, _aligned(aligned, blocks))
 
@@ -360,7 +360,9 @@ def _result(model: Model | ComparedRow, by_horizon: Iterable[_AtHorizon]) -> doc
     for row, one in zip(rows, sums, strict=True):
         if one is not None:
             errors_m = [float(f"{error:.6g}") for error in one.errors_m]
-            blocks.append(documents.BlocksDocument(row.horizon_m, **plain(one._asdict() | {"errors_m": errors_m})))
+            blocks.append(
+                documents.BlocksDocument(row.horizon_m, **plain_value(one._asdict() | {"errors_m": errors_m}))
+            )
     of_name = row_of(model.name)
     document = documents.ModelDocument(model.name, of_name.words, model.knows or of_name.knows, list(rows), blocks)
     return documents.ModelResult(document, bins, sums, tuple(row for row in free if row is not None), aligned)

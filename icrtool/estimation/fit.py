@@ -13,8 +13,7 @@ import numpy as np
 from icrtool.alignment.align import align, choose_reference
 from icrtool.alignment.mirrored_positions import with_right_positions
 from icrtool.config import Config
-from icrtool.estimation.run_filter import run_filter
-from icrtool.estimation.run_filter import smooth as smooth_run
+from icrtool.estimation.run_filter import run_filter, smooth_run
 from icrtool.estimation.summary import summarise
 from icrtool.kernels.arrays import Ints
 from icrtool.records.measurements import ReferenceJump, SensorData

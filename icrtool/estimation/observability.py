@@ -17,7 +17,7 @@ from icrtool.kernels.track import Track, Windows
 from icrtool.kernels.window_residuals import path_at, window_residuals
 from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.notes import Note, note
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, width_or_usual_m
 from icrtool.records.run_document import ExcitationDocument, Excited, NumberByIcr, VerdictByIcr
 from icrtool.records.tables import States
@@ -252,7 +252,7 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
             notes.append(note("icr_not_learned", f"{ICR_WORDS[name]} is not shown: {why}"))
         verdicts[name] = "not shown"
     return ExcitationDocument(
-        NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(turned_right),
+        NumberByIcr(*map(finite_or_none, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(turned_right),
         math.degrees(turned_left), math.degrees(spun_to_right), math.degrees(spun_to_left), tuple(notes),
     )  # fmt: skip
 

@@ -374,7 +374,7 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     return np.array(spans, np.int64).reshape(-1, 2)
 
 
-def smooth(run: Run) -> States:
+def smooth_run(run: Run) -> States:
     """Run the RTS smoother over a finished run.
 
     Parameters

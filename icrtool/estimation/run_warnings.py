@@ -14,7 +14,7 @@ from icrtool.estimation.run_filter import LARGEST_POSITION_MPS, STEP
 from icrtool.kernels.arrays import Bytes, Floats
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.records.measurements import Finding, WheelFacts
-from icrtool.records.notes import Note, about, note
+from icrtool.records.notes import Note, note, notes_about
 from icrtool.records.presets import ProcessNoise
 from icrtool.records.run import ICR_WORDS
 from icrtool.records.run_document import ExcitationDocument
@@ -231,7 +231,7 @@ def run_warnings(
         if share > WORTH_WARNING_SHARE:
             cause = _cause_of_rejection(findings.get(delays[word]))
             notes.append(note(REJECTED[word], f"{100 * share:.0f} % of the {word} were rejected: {cause}"))
-    return about(name, notes)
+    return notes_about(name, notes)
 
 
 def _cause_of_rejection(delay: Finding | None) -> str:

@@ -33,8 +33,8 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
-from icrtool.records.notes import Note, about, note, unusable_because, warnings_of
-from icrtool.records.plain_data import known
+from icrtool.records.notes import Note, note, notes_about, unusable_because, warnings_of
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.requests import FitRequest
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, track_of_states
 from icrtool.records.run_document import (
@@ -110,7 +110,7 @@ def summarise(
         measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance,
         rejected, inverted=inverted,
     )  # fmt: skip
-    notes = (*notes, *about(sensors.name, unusable))
+    notes = (*notes, *notes_about(sensors.name, unusable))
     hidden = () if rules.final_of_filter else excitation.verdict.not_shown
     lag = measurements.findings["heading_delay_s"]
     start_ns = int(table.stamp_ns[0])
@@ -182,7 +182,7 @@ def _notes(
             if t not in changes_s
         ),
         *noise_warnings(name, config, filtered.noise),
-        *about(name, excitation.notes),
+        *notes_about(name, excitation.notes),
     )
 
 
@@ -214,7 +214,7 @@ def _count(marked: Bools) -> int:
 
 
 def _mean(values: Floats) -> float | None:
-    return known(float(values.mean())) if len(values) else None
+    return finite_or_none(float(values.mean())) if len(values) else None
 
 
 def _spans(stamps_ns: Ints) -> Spans:
@@ -283,7 +283,7 @@ def icr_summary(
 
     def by_icr(values: Iterable[float]) -> NumberByIcr:
         rows = zip(ICR_COLUMNS, values, strict=True)
-        return NumberByIcr(*(None if column in hidden else known(value) for column, value in rows))
+        return NumberByIcr(*(None if column in hidden else finite_or_none(value) for column, value in rows))
 
     settled_icrs = (getattr(table, column)[after] for column in ICR_COLUMNS)
     means, stds = zip(*((float(one.mean()), float(one.std())) for one in settled_icrs), strict=True)
@@ -311,7 +311,10 @@ def segment_summary(table: States, changes_s: tuple[float, ...]) -> tuple[Segmen
     for begin, end in pairwise([0.0, *sorted(changes_s), float(table.t_s[-1])] if changes_s else []):
         inside = (table.t_s >= (begin + end) / 2) & (table.t_s <= end)
         icrs: list[Floats] = [getattr(table, column)[inside] for column in ICR_COLUMNS]
-        means, stds = ([_mean(one) for one in icrs], [known(float(one.std())) if len(one) else None for one in icrs])
+        means, stds = (
+            [_mean(one) for one in icrs],
+            [finite_or_none(float(one.std())) if len(one) else None for one in icrs],
+        )
         segments.append(SegmentDocument(begin, end, NumberByIcr(*means), NumberByIcr(*stds)))
     return tuple(segments)
 
@@ -336,8 +339,8 @@ def gnss_summary(
             rejected=_count(rows & outcome.rejected),
             down_weighted=_count(rows & fixes.down_weighted),
             sold_as_fixed=_count(rows & fixes.misreported),
-            std_m=known(measurements.fix_statistics.std_m[name]),
-            step_std_m=known(measurements.fix_statistics.step_std_m[name]),
+            std_m=finite_or_none(measurements.fix_statistics.std_m[name]),
+            step_std_m=finite_or_none(measurements.fix_statistics.step_std_m[name]),
         )
         for code, name in CLASSES.items()
         if (rows := fixes.fix_class == code).any()
@@ -349,7 +352,7 @@ def gnss_summary(
         rejected_by_reason=dict(rejected_fixes),
         recoveries=_count(outcome.code == RECOVERED),
         mean_difference_m=_mean(difference),
-        max_difference_m=known(float(difference.max())) if len(difference) else None,
+        max_difference_m=finite_or_none(float(difference.max())) if len(difference) else None,
         datum=(datum.latitude_deg, datum.longitude_deg, datum.height_m) if datum is not None else None,
         delay_s=delay.value,
         delay_std_s=delay.std,

@@ -27,7 +27,7 @@ from icrtool.output.text_blocks import Block, Items, Section, Table, Title
 from icrtool.records import fleet_document as documents
 from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog
 from icrtool.records.places import Below, is_regular
-from icrtool.records.process_resources import remove
+from icrtool.records.process_resources import remove_path
 from icrtool.records.rows import FALLBACK_ROW, MAIN_ROW
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.text import LogText, counted, escaped
@@ -209,7 +209,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
             formats.save_picture(figure, file)
             old.discard(file.path)
     for abandoned in old:
-        remove(abandoned)
+        remove_path(abandoned)
 
 
 def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:

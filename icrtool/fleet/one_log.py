@@ -22,7 +22,7 @@ from icrtool.pipeline import fit_into, report_into
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.fleet_document import FleetFile, FleetLog, fleet_verdict, next_low_name
 from icrtool.records.places import Below, UrlPath, place_of
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.requests import CalibrationInput, LogRequest
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.samples import InputFile

@@ -32,7 +32,7 @@ from icrtool.logs.containers.recording_files import (
     split_path,
     unpacked_name,
 )
-from icrtool.logs.containers.source import find
+from icrtool.logs.containers.source import find_logs_at
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.output.run_directory import RUN_FILE
 from icrtool.records.places import UrlPath, place_of, read_regular
@@ -75,7 +75,9 @@ def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
         if not (isinstance(place, UrlPath) or place.exists() or split_files(place)):
             raise LogError(place, "no such file or directory")
     logs, _ = logs_among(places)
-    recordings = joined({os.path.realpath(log): log for log in logs if not log.is_dir() or is_bag_directory(log)})
+    recordings = join_split_recordings(
+        {os.path.realpath(log): log for log in logs if not log.is_dir() or is_bag_directory(log)}
+    )
     if not recordings:
         what = places[0] if len(places) == 1 else f"{len(places)} places"
         raise LogError(what, "no recording in it", "a log is an .mcap, .bag or .db3 file, or a ROS 2 bag directory")
@@ -85,7 +87,7 @@ def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
     return _named(sorted(recordings.values(), key=natural_order), root)
 
 
-def joined(logs: Mapping[str, Path]) -> dict[str, Path]:
+def join_split_recordings(logs: Mapping[str, Path]) -> dict[str, Path]:
     """Return recordings in which the files of a split recording, or of a restarted recorder, are joined to one.
 
     They are files of one folder whose names differ only in a count or a date, that have the same topics, and of which
@@ -150,11 +152,11 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     by_path: dict[str, Path] = {}
     for place in places:
         if isinstance(place, UrlPath):
-            by_path |= {path.url: path for path in find(place)}
+            by_path |= {path.url: path for path in find_logs_at(place)}
             continue
         searched = place.is_dir() and not is_bag_directory(place) and not (place / RUN_FILE).is_file()
         below = {os.path.realpath(path): path for path in sorted(_search(place), key=natural_order)} if searched else {}
-        for real, path in (joined(below) or {os.path.realpath(place): place}).items():
+        for real, path in (join_split_recordings(below) or {os.path.realpath(place): place}).items():
             by_path.setdefault(real, path)
     logs = list(by_path.values())
     recordings = [path for path in logs if path.is_dir() or is_recording(path)]
@@ -391,7 +393,7 @@ def _entry(path: Path, row: Mapping[str, Any]) -> ManifestEntry:
 def _matching(path: Path, pattern: str) -> tuple[Path, ...]:
     """Return what a pattern matches; a file whose own name has a bracket or a star is taken as it is."""
     if isinstance(address := place_of(pattern), UrlPath):
-        return tuple(find(address))
+        return tuple(find_logs_at(address))
     full_pattern = path.parent / pattern
     try:
         if full_pattern.exists():

@@ -203,7 +203,7 @@ def _report_definitions(container: Container, channels: Sequence[Channel]) -> No
             container.report("definition_bundled", f"{channel.topic}: {note}; the bundled definition is used")
 
 
-def moment(given: Moment | None, key: str) -> float | datetime | None:
+def read_moment(given: Moment | None, key: str) -> float | datetime | None:
     """Return a moment as seconds since the log's first message, or as a time with a zone.
 
     Raises
@@ -246,8 +246,8 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
         else:  # without an index the first and last time are found by reading all messages
             blocks = container.blocks(frozenset(channel.id for channel in container.channels))
             first = min((int(block.log_time_ns.min()) for block in blocks if len(block.log_time_ns)), default=0)
-    begin_ns = max(nanoseconds(start, first), 0) if start is not None else 0
-    end_ns = nanoseconds(end, first) if end is not None else LATEST_NS
+    begin_ns = max(log_time_of(start, first), 0) if start is not None else 0
+    end_ns = log_time_of(end, first) if end is not None else LATEST_NS
     if begin_ns >= end_ns:
         raise DataError(log, "the part to read ends before it begins", "give an end later than the start")
     if span is not None and (begin_ns > span[1] or end_ns <= span[0]):
@@ -258,7 +258,7 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
     return Cut(begin_ns, min(end_ns, LATEST_NS))
 
 
-def nanoseconds(given: float | datetime, first_ns: int) -> int:
+def log_time_of(given: float | datetime, first_ns: int) -> int:
     """Return a moment as log time [ns]."""
     if isinstance(given, datetime):
         passed = given - datetime(1970, 1, 1, tzinfo=UTC)
@@ -283,7 +283,7 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
     """
     import pandas as pd
 
-    begin, stop = moment(start, "start"), moment(end, "end")
+    begin, stop = read_moment(start, "start"), read_moment(end, "end")
     before = states_of(path)
     try:
         with plain_file(path) as (file, read):
@@ -301,8 +301,8 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
             stamps = pd.to_numeric(table[clock], errors="coerce") * unit
             inside = np.isfinite(stamps)
             first = int(stamps[inside].min()) if inside.any() else 0
-            inside &= stamps >= nanoseconds(begin, first) if begin is not None else True
-            inside &= stamps < nanoseconds(stop, first) if stop is not None else True
+            inside &= stamps >= log_time_of(begin, first) if begin is not None else True
+            inside &= stamps < log_time_of(stop, first) if stop is not None else True
             table = table[inside]
     log = RobotLog.from_frames(table, table, table, table, log_name(path))
     notes = (note("table_form", f"read with {form}", log.name),) if form else ()

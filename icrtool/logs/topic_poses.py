@@ -25,7 +25,7 @@ from icrtool.logs.streams.positions import (
     every_transform_pose,
     is_static,
 )
-from icrtool.logs.streams.sources import increasing, number, stamp_rows
+from icrtool.logs.streams.sources import increasing_rows, number_of, stamp_rows
 from icrtool.records.places import place_of
 from icrtool.records.text import did_you_mean, listed
 from icrtool.records.topic_poses import TopicPoses
@@ -136,13 +136,13 @@ def _poses_of(table: TopicTable, log: Path) -> TopicPoses:
     kind = str(table.message_type)
     if table.message_type in TRANSFORM_TYPES:
         table = every_transform_pose(table)
-    x, y, *q = (number(table, one, needed=True) for one in POSE_FIELDS[table.message_type])
+    x, y, *q = (number_of(table, one, needed=True) for one in POSE_FIELDS[table.message_type])
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.sqrt(sum(one * one for one in q))
         usable: Bools = (norm > LEAST_QUATERNION) & (norm < LARGEST_QUATERNION) & np.isfinite(x) & np.isfinite(y)
     stamps = stamp_rows(table)
     order = stamps.header_ns if stamps.header_ns is not None else stamps.log_ns
-    kept, _, _ = increasing(order, usable)
+    kept, _, _ = increasing_rows(order, usable)
     if len(order[kept]) < 2:
         raise DataError(log, f"{table.topic} holds {len(order[kept])} usable poses", "at least two are needed")
     ahead, left, _ = turned_axis(0, *(one[kept] / norm[kept] for one in q))

@@ -84,7 +84,7 @@ def heading_wander(turned: Floats, length_m: Floats) -> float:
     return max(far - near, 0.0) / (long - short)
 
 
-def shortening(wander: float, length_m: Floats) -> Floats:
+def shortening_by_wander(wander: float, length_m: Floats) -> Floats:
     """Return the mean ratio (w,) of a window's displacement to its value without wander of the heading.
 
     Parameters
@@ -137,7 +137,7 @@ def residuals_of(
         path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, knot_t + delay)
         turned, turned_by = turn_residuals(path, start, end, seen_turned, root)
         strayed = heading_wander(turned * root, windows.length_m) if wander is None else wander
-        share = shortening(strayed, windows.length_m)
+        share = shortening_by_wander(strayed, windows.length_m)
         moved, moved_by = window_residuals(path, start, end, seen, offset, root, share)
         # from the order terms, gyro columns, offset, delay to the order terms, `LogConstants`
         k, terms = len(parameters), len(axes)

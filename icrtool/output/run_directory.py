@@ -37,7 +37,7 @@ from icrtool.records.places import (
     place_of,
     read_regular,
 )
-from icrtool.records.plain_data import Record, plain
+from icrtool.records.plain_data import Record, plain_value
 from icrtool.records.requests import FitRequest
 from icrtool.records.run import Run
 from icrtool.records.run_document import EVENT_COLUMNS, RUN_SCHEMA, EventDocument, RunDocument
@@ -157,7 +157,7 @@ def changed_settings(directory: Path, config: Config, request: FitRequest) -> li
 
 
 def _same(stored: object, asked: object) -> bool:
-    return json.dumps(plain(stored), sort_keys=True) == json.dumps(plain(asked), sort_keys=True)
+    return json.dumps(plain_value(stored), sort_keys=True) == json.dumps(plain_value(asked), sort_keys=True)
 
 
 def _stated(value: object) -> str:

@@ -21,13 +21,13 @@ from icrtool.output.files.atomic import (
     check_directory,
     partial_at,
     place_errors,
-    put,
+    put_in_place,
     sync_tree,
 )
 from icrtool.output.files.formats import csv_bytes, json_bytes, read_numbers, schema_of
 from icrtool.records.choices import StudyName
 from icrtool.records.places import Below
-from icrtool.records.process_resources import remove
+from icrtool.records.process_resources import remove_path
 from icrtool.simulation.drives import TrackSpeeds, TruthTable
 from icrtool.simulation.study_records import StudyResult
 
@@ -72,9 +72,9 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
                 raise OutputError(log, err.why, err.advice) from err
             sync_tree(fresh)
             # If the process is killed from here on, the log has no truth, but never the truth of another log.
-            remove(truth)
-            put(fresh / log.name, log.absolute())
-            put(fresh / truth.name, truth.absolute())
+            remove_path(truth)
+            put_in_place(fresh / log.name, log.absolute())
+            put_in_place(fresh / truth.name, truth.absolute())
 
 
 BAG = Kind(

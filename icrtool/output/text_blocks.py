@@ -2,7 +2,7 @@
 
 A document (a run, a report, a comparison) is a list of blocks. The code that lays blocks out (here, in
 `icrtool.cli.printing` and `icrtool.output.page`) does not depend on runs or reports. A document lists all possible
-blocks; empty blocks are left out of the layout (`stated`).
+blocks; empty blocks are left out of the layout (`stated_blocks`).
 """
 
 from __future__ import annotations
@@ -196,12 +196,12 @@ Block = str | Title | Line | Table | Facts | Checks | Items | Figure | Section
 Printed = str | Line | Table
 
 
-def stated(blocks: Iterable[Block]) -> Iterator[Block]:
+def stated_blocks(blocks: Iterable[Block]) -> Iterator[Block]:
     """Yield the blocks that are not empty, after empty sentences of facts are left out."""
     for block in blocks:
         match block:
             case Section():
-                if (inner := list(stated(block.blocks))) or block.lead:
+                if (inner := list(stated_blocks(block.blocks))) or block.lead:
                     yield block._replace(blocks=inner)
             case Facts():
                 if rows := [row for row in block.rows if row[1]]:
@@ -215,7 +215,7 @@ def stated(blocks: Iterable[Block]) -> Iterator[Block]:
 def format_blocks(blocks: Iterable[Block], *, verbose: bool = True) -> str:
     """Return a document as plain text, at most `TEXT_WIDTH` wide where it can be wrapped; no line end."""
     lines: list[str] = []
-    for block in printed(blocks, verbose=verbose):
+    for block in printed_parts(blocks, verbose=verbose):
         if isinstance(block, Table):
             lines += _table_lines(block)
         elif isinstance(block, Line):
@@ -229,9 +229,9 @@ GRADE_LOOKS: dict[Grade, Look] = {"good": "good", "care": "as is", "bad": "bad",
 GRADE_MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": ""}
 
 
-def printed(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:
+def printed_parts(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:
     """Yield the printed parts of a document: the brief answer in `BRIEF_WIDTH`, or all parts that are not page-only."""
-    for block in stated(blocks):
+    for block in stated_blocks(blocks):
         if isinstance(block, str | Line):
             yield block
         elif isinstance(block, Title):
@@ -264,7 +264,7 @@ def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
         yield _sentence(label, text, 3, GRADE_LOOKS[section.grade], verbose=verbose)
     # a table whose caption is the title that was just printed
     titled = section.title if verbose else ""
-    yield from printed(
+    yield from printed_parts(
         (
             one._replace(caption="") if isinstance(one, Table) and titled and one.caption == titled else one
             for one in section.blocks
@@ -357,7 +357,7 @@ def _markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
         if isinstance(block, Title):
             yield from ("", f"## {_escaped_markdown(block.text)}", "", _escaped_markdown(block.facts), "")
             continue
-        for one in printed([block], verbose=True):
+        for one in printed_parts([block], verbose=True):
             if isinstance(one, Table):
                 rows = [[_escaped_markdown(cell.strip()) for cell in row] for row in one.lines()]
                 rule = ["---" if side == "l" else "---:" for side in one.sides()]

@@ -92,7 +92,7 @@ def _of_environment(variable: str, parse: Callable[[str], Limit]) -> Limit | Non
 
 
 @contextmanager
-def limited(variable: str, value: float) -> Iterator[None]:
+def set_limit(variable: str, value: float) -> Iterator[None]:
     """Have a limit in the environment of this process until the block ends."""
     before = os.environ.get(variable)
     os.environ[variable] = f"{value!r}"

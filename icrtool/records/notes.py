@@ -52,7 +52,7 @@ def note(code: str, text: str, subject: str = "") -> Note:
     return Note(code, CATALOGUE[code].grade, str.__str__(subject), str.__str__(text))
 
 
-def about(subject: str, notes: Iterable[Note]) -> tuple[Note, ...]:
+def notes_about(subject: str, notes: Iterable[Note]) -> tuple[Note, ...]:
     """Return findings with a log or file of this name as their subject."""
     plain = str.__str__(subject)
     return tuple(msgspec.structs.replace(one, subject=plain) for one in notes)

@@ -15,12 +15,12 @@ class Record(msgspec.Struct, frozen=True):
     """Part of a JSON document: read with its types checked; keys that it does not know are ignored."""
 
 
-def known(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
     """Return a number, None where it is not finite."""
     return value if math.isfinite(value) else None
 
 
-def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
+def plain_value(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
     """Return a value as JSON gives it back: lists, dicts, text, numbers; None for what is not a finite number.
 
     Of a dataclass, only fields that are compared and set are content.
@@ -31,13 +31,13 @@ def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
     if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, float):
-        return known(value)
+        return finite_or_none(value)
     if isinstance(value, msgspec.Struct):
         value = dict(zip(value.__struct_encode_fields__, msgspec.structs.astuple(value), strict=True))
     elif is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value) if field.compare}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items() if item is not msgspec.UNSET}
+        return {str(key): plain_value(item) for key, item in value.items() if item is not msgspec.UNSET}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [plain_value(item) for item in value]
     return value

@@ -18,12 +18,12 @@ _paths: set[Path] = set()
 _undisturbed: list[bool] = []
 
 
-def begin(path: Path) -> None:
-    """Have `remove_unfinished` remove a file or directory, until `end` is called."""
+def mark_unfinished(path: Path) -> None:
+    """Have `remove_unfinished` remove a file or directory, until `mark_finished` is called."""
     _paths.add(path)
 
 
-def end(path: Path) -> None:
+def mark_finished(path: Path) -> None:
     """Keep what is at a path from now on: it is complete, or its name is about to become another's."""
     _paths.discard(path)
 
@@ -31,11 +31,11 @@ def end(path: Path) -> None:
 @contextmanager
 def unfinished(path: Path) -> Iterator[None]:
     """Remove a file or directory in `remove_unfinished` until the block ends."""
-    begin(path)
+    mark_unfinished(path)
     try:
         yield
     finally:
-        end(path)
+        mark_finished(path)
 
 
 @contextmanager
@@ -57,12 +57,12 @@ def remove_unfinished() -> None:
     """Remove all that is being written; called where no other code of this process will do it any more."""
     for path in list(_paths):
         for _ in range(TRIES):
-            remove(path)
+            remove_path(path)
             if not path.exists():
                 break
 
 
-def remove(path: Path) -> None:
+def remove_path(path: Path) -> None:
     """Remove a file or a directory, as far as that is possible."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)

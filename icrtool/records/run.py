@@ -17,7 +17,7 @@ from icrtool.kernels.track import Track
 from icrtool.records.choices import FigureSet, StatesFormat
 from icrtool.records.measurements import SensorData, intervals_in
 from icrtool.records.notes import Note
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.samples import are_twist
 from icrtool.records.tables import Icrs, States
 
@@ -171,7 +171,7 @@ class Run:
     @property
     def summary(self) -> dict[str, Any]:
         """What run.json holds, as plain data."""
-        found: dict[str, Any] = plain(self.document)
+        found: dict[str, Any] = plain_value(self.document)
         return found
 
     @property

@@ -45,7 +45,7 @@ class Samples:
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
-def thin(column: Floats) -> Floats:
+def without_repeats(column: Floats) -> Floats:
     """Return a column; one whose values are all equal takes no memory."""
     return np.broadcast_to(column[:1].copy(), column.shape) if len(column) and (column == column[0]).all() else column
 

@@ -300,7 +300,7 @@ def drive_plan(plan: DrivePlan, tail_s: float, rng: np.random.Generator | None =
     )  # fmt: skip
 
 
-def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Generator) -> Readings:
+def sense_motion(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Generator) -> Readings:
     """Return the measurements of the true motion from time 0 to `duration_s` [s].
 
     Notes
@@ -372,9 +372,9 @@ def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorColumn
     """
     check_drive(plan, sensors)
     truth = drive_plan(plan, 1.0 / sensors.wheel_rate_hz, np.random.default_rng((seed, 2)))
-    readings = sense(truth, sensors, plan.duration_s, np.random.default_rng((seed, 0)))
+    readings = sense_motion(truth, sensors, plan.duration_s, np.random.default_rng((seed, 0)))
     times, row = readings.wheel_t, truth.rows(readings.wheel_t)
-    columns: TruthTable = {"stamp_ns": stamps(times), "t_s": times - times[0]}
+    columns: TruthTable = {"stamp_ns": stamps_of(times), "t_s": times - times[0]}
     columns |= zip(("north_m", "east_m", "heading_rad"), truth.poses(times).T, strict=True)
     columns |= zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), truth.icrs(times).T, strict=True)
     columns |= {"v_left_mps": truth.v_left_mps[row], "v_right_mps": truth.v_right_mps[row]}
@@ -390,23 +390,23 @@ def record_drive(readings: Readings, sensors: Sensors, rng: np.random.Generator)
     latitude, longitude, height = ned2geodetic(*readings.gnss_m.T, down, *DATUM)
     status = 2 if sensors.gnss_std_m <= LARGEST_RTK_STD_M else 1 if sensors.gnss_std_m <= LARGEST_SBAS_STD_M else 0
     return SensorColumns(
-        wheel_stamp_ns=stamps(readings.wheel_t),
+        wheel_stamp_ns=stamps_of(readings.wheel_t),
         wheel_position_left_m=readings.travel_left_m,
         wheel_position_right_m=readings.travel_right_m,
         wheel_v_left_mps=readings.v_left_mps,
         wheel_v_right_mps=readings.v_right_mps,
-        gnss_stamp_ns=stamps(readings.gnss_t + sensors.gnss_delay_s),
+        gnss_stamp_ns=stamps_of(readings.gnss_t + sensors.gnss_delay_s),
         latitude_deg=np.asarray(latitude, np.float64),
         longitude_deg=np.asarray(longitude, np.float64),
         height_m=np.asarray(height, np.float64),
         gnss_std_m=np.full(fixes, sensors.gnss_std_m),
         gnss_status=np.full(fixes, status, np.int64),
-        heading_stamp_ns=stamps(readings.heading_t + sensors.heading_delay_s),
+        heading_stamp_ns=stamps_of(readings.heading_t + sensors.heading_delay_s),
         heading_rad=wrapped(readings.heading_rad),
         yaw_rate_radps=readings.yaw_rate_radps,
     )
 
 
-def stamps(times: Floats, start_ns: int = START_NS) -> Ints:
+def stamps_of(times: Floats, start_ns: int = START_NS) -> Ints:
     """Return times [s] as stamps of the log's clock."""
     return start_ns + np.rint(times * 1e9).astype(np.int64)

@@ -78,12 +78,12 @@ def by_preset(
     return vary
 
 
-def sensing(base: Scenario, **sensors: Any) -> Scenario:
+def with_sensors(base: Scenario, **sensors: Any) -> Scenario:
     """Return a scenario with other sensors."""
     return replace(base, sensors=replace(base.sensors, **sensors))
 
 
-def driving(base: Scenario, **path: Any) -> Scenario:
+def with_path(base: Scenario, **path: Any) -> Scenario:
     """Return a scenario with another path."""
     return replace(base, plan=replace(base.plan, path=replace(cast(PathPlan, base.plan.path), **path)))
 
@@ -91,7 +91,7 @@ def driving(base: Scenario, **path: Any) -> Scenario:
 def at_rate(base: Scenario, rate: float) -> Scenario:
     """Return a scenario with another rate of wheels and heading; a higher rate of the fixes is reduced to it."""
     gnss_rate = min(rate, base.sensors.gnss_rate_hz)
-    return sensing(base, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
+    return with_sensors(base, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
 
 
 def from_source(base: Scenario, name: str) -> Scenario:
@@ -100,8 +100,8 @@ def from_source(base: Scenario, name: str) -> Scenario:
     The bias is the difference of command and track speed. The drives of both scenarios are the same.
     """
     if name == "encoder":
-        return sensing(base, wheels="encoder", input_bias_mps=0.0)
-    return sensing(base, wheels="commanded", wheel_rate_hz=base.plan.command_rate_hz)
+        return with_sensors(base, wheels="encoder", input_bias_mps=0.0)
+    return with_sensors(base, wheels="commanded", wheel_rate_hz=base.plan.command_rate_hz)
 
 
 def on_circle(base: Scenario, radius: float) -> Scenario:
@@ -112,7 +112,7 @@ def on_circle(base: Scenario, radius: float) -> Scenario:
     """
     outer, path = abs(base.plan.icrs_m[1]), cast(PathPlan, base.plan.path)
     speed = path.speed_mps * (radius / (radius + outer) if radius else 1.0)
-    return replace(driving(base, kind="circle", radius_m=radius, speed_mps=speed), inflate=True)
+    return replace(with_path(base, kind="circle", radius_m=radius, speed_mps=speed), inflate=True)
 
 
 def by_start(request: StudyRequest) -> Iterator[Setting]:
@@ -149,7 +149,7 @@ def starting_at(config: Config, icrs_m: Icrs, **settings: float) -> Config:
     return config.with_filter(**dict(zip(names, icrs_m, strict=True)), **settings)
 
 
-def changed(icrs_m: Icrs, number: int) -> Icrs:
+def changed_icrs(icrs_m: Icrs, number: int) -> Icrs:
     """Return the ICRs after change 1, 2, …: alternately wider and narrower. The paper does not state its values."""
     right, left, x = icrs_m
     width = right - left
@@ -207,7 +207,7 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
         runs=20,
         values=STUDY_NOISES,
         plan=WINDING,
-        vary=by_preset(lambda base, value: sensing(base, **{sensors_field: value})),
+        vary=by_preset(lambda base, value: with_sensors(base, **{sensors_field: value})),
         measures=(measured.measure_estimates,),
         numbers=(Number("{series}: error of {icr} at {value:g} m/s", ERROR_COLUMN, "spread", "m", paper, largest),),
         title=f"{{value:g}} m/s of {word} moves y right by {{answer}}",
@@ -237,7 +237,7 @@ STUDIES: dict[str, Study] = {
         presets=("paper",),
         runs=200,
         paths=PATHS,
-        vary=by_preset(lambda base, kind: driving(base, kind=kind)),
+        vary=by_preset(lambda base, kind: with_path(base, kind=kind)),
         measures=(measured.measure_times, measured.measure_estimates, trace(end_s=SHOWN_S)),
         numbers=(Number("{value} ({series}): all three ICRs converged after", "settle_s", "spread", "s", PATH_TIMES),),
         title="Time to settle on a path of kind {value}: {answer}",
@@ -317,7 +317,7 @@ STUDIES: dict[str, Study] = {
         runs=20,
         values=(0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
         plan=replace(PLAN, path=PathPlan("lawnmower"), duration_s=300.0),
-        vary=by_preset(lambda base, value: sensing(base, gnss_std_m=value)),
+        vary=by_preset(lambda base, value: with_sensors(base, gnss_std_m=value)),
         measures=(measured.measure_estimates, measured.measure_times, measured.measure_open_loop),
         numbers=(
             Number("no slip: open loop after 10 m, p95", "blind_no_slip_10m_p95_m", "first", "m"),
@@ -340,7 +340,7 @@ STUDIES: dict[str, Study] = {
             PLAN, icrs_m=(0.6, -0.6, 0.0), path=PathPlan(radius_m=5.0), motor_lag_s=0.1, robot=FrictionRobot()
         ),
         sensors=replace(IDEAL, wheels="encoder"),
-        vary=by_preset(lambda base, value: driving(base, speed_mps=value)),
+        vary=by_preset(lambda base, value: with_path(base, speed_mps=value)),
         measures=(measured.measure_means,),
         numbers=(
             *(
@@ -416,7 +416,7 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
         if plan.duration_s <= times_s[0]:
             why = f"{plan.duration_s:g} s end before the first change, at {times_s[0]:g} s"
             raise ConfigError("duration", why, "drive longer, or give earlier times with --change")
-        changes = ((time, changed(plan.icrs_m, number)) for number, time in enumerate(times_s, start=1))
+        changes = ((time, changed_icrs(plan.icrs_m, number)) for number, time in enumerate(times_s, start=1))
         plan = replace(plan, changes=tuple(change for change in changes if change[0] < plan.duration_s))
         request = replace(request, plan=plan)
     settings = list(study.vary(request))

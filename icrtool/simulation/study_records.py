@@ -279,19 +279,19 @@ class StudyResult:
     def findings(self) -> list[StudyNumber]:
         """Numbers to compare with the paper's."""
         numbers = self.study.numbers
-        return numbers(self.levels) if callable(numbers) else reported(numbers, self.levels)
+        return numbers(self.levels) if callable(numbers) else reported_numbers(numbers, self.levels)
 
     @property
     def answer(self) -> list[StudyNumber]:
         """The number that answers the study's question, by series."""
-        return reported([self.study.answer], self.levels)
+        return reported_numbers([self.study.answer], self.levels)
 
     def records(self) -> list[dict[str, Any]]:
         """Return the content of study.json for the levels."""
         return [{**one.names, **self.study.summary(one.found), "metrics": one.metrics()} for one in self.levels]
 
 
-def reported(numbers: Sequence[Number], levels: Sequence[Level]) -> list[StudyNumber]:
+def reported_numbers(numbers: Sequence[Number], levels: Sequence[Level]) -> list[StudyNumber]:
     """Return numbers of levels, in the order of the levels, the ICRs and `numbers`."""
     pooled: dict[str, tuple[Number, Level, dict[int, Floats]]] = {}
     at = [number.values_among(levels) for number in numbers]

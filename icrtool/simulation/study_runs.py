@@ -186,7 +186,7 @@ def _simulate(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, F
     if isinstance(plan.path, PathPlan):
         plan = replace(plan, path=replace(plan.path, phase_rad=phase))
     motion = drives.drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz, rng)
-    readings = drives.sense(motion, scenario.sensors, plan.duration_s, rng)
+    readings = drives.sense_motion(motion, scenario.sensors, plan.duration_s, rng)
     return readings, np.column_stack([motion.poses(readings.wheel_t), motion.icrs(readings.wheel_t)]), motion
 
 
@@ -219,10 +219,10 @@ def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
     north, east = readings.gnss_m.T
     return RobotLog(
         name="study",
-        wheels=WheelSamples(drives.stamps(readings.wheel_t, 0), readings.v_left_mps, readings.v_right_mps),
-        gnss=PositionFixes(drives.stamps(readings.gnss_t, 0), north, east, variance, variance, np.zeros(fixes)),
+        wheels=WheelSamples(drives.stamps_of(readings.wheel_t, 0), readings.v_left_mps, readings.v_right_mps),
+        gnss=PositionFixes(drives.stamps_of(readings.gnss_t, 0), north, east, variance, variance, np.zeros(fixes)),
         heading=HeadingSamples(
-            drives.stamps(readings.heading_t, 0), readings.heading_rad, np.full(headings, sensors.heading_std_rad**2)
+            drives.stamps_of(readings.heading_t, 0), readings.heading_rad, np.full(headings, sensors.heading_std_rad**2)
         ),
         datum=None,
         streams=(),
@@ -236,7 +236,7 @@ def measure_estimates(run: StudyRun) -> Found:
     """Return mean and rms error and the stated std of each ICR over the second half of a run, and the NIS."""
     half = len(run.t_s) // 2
     error = run.x[half:, 3:] - run.truth[half:, 3:]
-    numbers: Found = {"inverted": inverted(run)}
+    numbers: Found = {"inverted": is_inverted(run)}
     for place, name in enumerate(ICR_NAMES):
         numbers[f"final_{name}_m"] = run.x[-1, 3 + place]
         numbers[f"std_{name}_m"] = run.std[-1, 3 + place]
@@ -251,7 +251,7 @@ def measure_means(run: StudyRun) -> Found:
     Also the mean distance of the filter's position from the true one.
     """
     half = len(run.t_s) // 2
-    found: Found = {"inverted": inverted(run)}
+    found: Found = {"inverted": is_inverted(run)}
     for place, name in enumerate(ICR_NAMES, start=3):
         found[f"mean_{name}_m"] = run.x[half:, place].mean()
         found[f"scatter_{name}_m"] = run.x[half:, place].std()
@@ -282,12 +282,12 @@ def measure_changes(run: StudyRun) -> Found:
     plan = run.scenario.plan
     spans = enumerate(pairwise([*(time for time, _ in plan.changes), plan.duration_s]), start=1)
     times = {f"change{n}_{name}": time for n, span in spans for name, time in measure_times(run, *span).items()}
-    return {"inverted": inverted(run), **times}
+    return {"inverted": is_inverted(run), **times}
 
 
 def measure_one_change(run: StudyRun) -> Found:
     """Return whether a run ended inverted, and its times after the first change of the ICRs."""
-    return {"inverted": inverted(run), **measure_times(run, run.scenario.plan.changes[0][0])}
+    return {"inverted": is_inverted(run), **measure_times(run, run.scenario.plan.changes[0][0])}
 
 
 def convergence_time(t: Floats, value: Floats, target: float) -> float:
@@ -322,7 +322,7 @@ def settling_time(t: Floats, value: Floats, target: float) -> float:
     return max(float(t[settled]), 0.0) if settled < len(t) else np.nan
 
 
-def inverted(run: StudyRun) -> float:
+def is_inverted(run: StudyRun) -> float:
     """Return 1 where a run ended with y_icr_right <= y_icr_left, or with NaN; else 0."""
     return float(not run.x[-1, 3] > run.x[-1, 4])
 
@@ -331,7 +331,7 @@ def measure_fate(run: StudyRun) -> Found:
     """Return which of `FATES` a run had, as 1 and 0, and the ICRs at its end."""
     last = max(1, len(run.x) // LAST_SHARE)
     error = np.abs(run.x[-last:, 3:] - run.truth[-last:, 3:]).mean(axis=0)
-    near, wrong = float((error < CONVERGED_M).all()), inverted(run)
+    near, wrong = float((error < CONVERGED_M).all()), is_inverted(run)
     fates = dict(zip(FATES, (near, wrong * (1 - near), (1 - wrong) * (1 - near)), strict=True))
     return {**fates, **{f"final_{name}_m": run.x[-1, 3 + place] for place, name in enumerate(ICR_NAMES)}}
 

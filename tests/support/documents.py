@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from icrtool.records.notes import note
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.run import Run
 from icrtool.records.run_document import RunDocument
 
@@ -20,7 +20,7 @@ def document_of(run: Run, **changes: Any) -> RunDocument:
     """
     summary = run.summary
     if "warnings" in changes:
-        changes["notes"] = [plain(note("log_damaged", text)) for text in changes["warnings"]]
+        changes["notes"] = [plain_value(note("log_damaged", text)) for text in changes["warnings"]]
     for name, value in changes.items():
         summary[name] = summary[name] | value if isinstance(value, dict) else value
     return msgspec.convert(summary, RunDocument)

@@ -10,7 +10,7 @@ import msgspec
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.records.dropout_document import ModelResult, Outage
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run_document import RunDocument
 
 
@@ -38,7 +38,7 @@ def with_models(report: DropoutReport, *results: ModelResult) -> DropoutReport:
 def with_numbers(result: ModelResult, name: str | None = None, **columns: Sequence[float]) -> ModelResult:
     """Return a model with other numbers, by horizon; NaN for none."""
     rows = [
-        msgspec.structs.replace(row, **dict(zip(columns, map(known, map(float, values)), strict=True)))
+        msgspec.structs.replace(row, **dict(zip(columns, map(finite_or_none, map(float, values)), strict=True)))
         for row, *values in zip(result.document.by_horizon, *columns.values(), strict=True)
     ]
     named = {} if name is None else {"name": name}

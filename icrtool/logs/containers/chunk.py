@@ -254,6 +254,6 @@ def follow_records(
     return starts, at
 
 
-def unaligned(data: Bytes, kind: str | np.dtype[Any]) -> NDArray[Any]:
+def values_at_each_byte(data: Bytes, kind: str | np.dtype[Any]) -> NDArray[Any]:
     """Return the value that begins at each byte."""
     return np.ndarray(max(len(data) - np.dtype(kind).itemsize + 1, 0), kind, data, strides=(1,))

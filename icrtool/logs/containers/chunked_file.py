@@ -21,7 +21,7 @@ from icrtool.logs.containers.chunk import (
     Space,
     decompress,
 )
-from icrtool.logs.containers.container import Channel, Container, Cut, MessageBlock, ahead, made_ahead
+from icrtool.logs.containers.container import Channel, Container, Cut, MessageBlock, made_ahead, work_ahead
 from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile
 
 CHUNK_THREADS = 2
@@ -196,7 +196,7 @@ class ChunkedFile(Container):
         located = (self._located(chunk, wanted) for chunk in needed)
         parts = located if self._remote is None else self._read_ahead(self._remote, needed, wanted)
         groups = zip(_groups(parts), reused_spaces(), strict=False)
-        for (group, spaces), made in ahead(lambda one: self._joined(*one), groups, CHUNK_THREADS, BLOCKS_AHEAD):
+        for (group, spaces), made in work_ahead(lambda one: self._joined(*one), groups, CHUNK_THREADS, BLOCKS_AHEAD):
             self._at = group[-1].chunk.at
             try:
                 block, inflation = made()
@@ -218,7 +218,9 @@ class ChunkedFile(Container):
             return [self._located(chunk, wanted) for chunk in group]
 
         spans = _spans(chunks, wanted)
-        for _, parts in ahead(located, spans, READERS, SPANS_AHEAD, lambda span: (span[2] - span[1]) / BYTES_AHEAD):
+        for _, parts in work_ahead(
+            located, spans, READERS, SPANS_AHEAD, lambda span: (span[2] - span[1]) / BYTES_AHEAD
+        ):
             yield from parts()
 
     def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Part:

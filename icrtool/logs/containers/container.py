@@ -127,7 +127,7 @@ class Cut(NamedTuple):
 WHOLE = Cut()
 
 
-def ahead(
+def work_ahead(
     work: Callable[[Item], Result], items: Iterable[Item], threads: int, count: int,
     weight: Callable[[Item], float] = lambda _: 0.0,
 ) -> Generator[tuple[Item, Callable[[], Result]]]:  # fmt: skip

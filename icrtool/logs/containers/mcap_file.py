@@ -23,7 +23,7 @@ from icrtool.logs.containers.chunk import (
     Records,
     Space,
     record_starts,
-    unaligned,
+    values_at_each_byte,
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
 from icrtool.logs.containers.container import LARGEST_DESCRIPTIONS_BYTES, Channel, MessageBlock, ros_type_name
@@ -97,7 +97,7 @@ def _message_ends(data: Bytes, at: Ints) -> Ints:
 
 def _message_heads(data: Bytes, at: Ints) -> NDArray[Any]:
     """Return the heads (n,) of messages."""
-    together: NDArray[Any] = unaligned(data, f"V{_MESSAGE_HEADS.itemsize}")[at].view(_MESSAGE_HEADS)
+    together: NDArray[Any] = values_at_each_byte(data, f"V{_MESSAGE_HEADS.itemsize}")[at].view(_MESSAGE_HEADS)
     return together
 
 

@@ -21,7 +21,7 @@ from icrtool.logs.containers.chunk import (
     Records,
     Space,
     record_starts,
-    unaligned,
+    values_at_each_byte,
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
 from icrtool.logs.containers.container import LARGEST_DESCRIPTIONS_BYTES, Channel, MessageBlock, ros_type_name
@@ -99,14 +99,14 @@ def _message_index(index: bytes) -> tuple[Ints, Ints]:
 def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
     """Find the message and connection records of a ROS 1 bag from `begin` on; as `scan_mcap`."""
     starts, stop = record_starts(data, begin, hint, _behind_record, _record_ends)
-    sizes = unaligned(data, "<u4")[starts] + np.int64(8)
+    sizes = values_at_each_byte(data, "<u4")[starts] + np.int64(8)
     table = np.empty((5, len(starts)), np.int64)
     left, rounds = np.arange(len(starts)), 0
     while len(left):
         # Most records have headers of the same fields.
         size = int(sizes[left[0]])
         fits = sizes[left] == size if rounds < _MOST_HEADERS else np.arange(len(left)) == 0
-        heads = unaligned(data, f"V{size}")[starts[left if fits.all() else left[fits]]]
+        heads = values_at_each_byte(data, f"V{size}")[starts[left if fits.all() else left[fits]]]
         header = heads[0].tobytes()[4:-4]
         values = [(name, begin + 4) for name, begin, end in _fields(header) if end - begin == _VALUE_BYTES.get(name)]
         fields = {name: at for name, at in values if at + _VALUE_BYTES[name] <= size - 4}
@@ -148,7 +148,7 @@ def _behind_record(data: memoryview, at: int, end: int) -> int:
 
 def _record_ends(data: Bytes, at: Ints) -> Ints:
     """Return where records (n,) of a bag end, for headers of the first one's length; else where they begin."""
-    lengths, last = unaligned(data, "<u4"), len(data) - 4
+    lengths, last = values_at_each_byte(data, "<u4"), len(data) - 4
     size = 8 + int(lengths[at[0]]) if at[-1] <= last else len(data)
     if at[-1] + size > len(data):
         return at

@@ -124,7 +124,7 @@ class RemoteFile:
         self.size = int(about.get("size") or 0)
         self.has_ranges = not self.is_folder and self.size > 0 and about.get("partial") is not False
         if self.has_ranges and path.scheme.startswith("http"):
-            self.has_ranges = asked(path, self._gives_last_byte)
+            self.has_ranges = ask_server(path, self._gives_last_byte)
         self.version = version_of(about)
         """What the store states about the content: ``version``, or else ``etag``; none where it states neither."""
         self.input = InputFile(str(path), self.size, None, **self.version, address=path.digest)
@@ -221,7 +221,7 @@ class RemoteFile:
                 raise broken
             return list(map(bytes, pieces))
 
-        pieces = asked(self.path, ask)
+        pieces = ask_server(self.path, ask)
         for piece, begin, end in zip(pieces, begins, ends, strict=True):
             if len(piece) != end - begin:
                 raise LogError(self.path, f"gave {len(piece)} bytes for {end - begin}", "is it being written?")
@@ -266,14 +266,14 @@ class RemoteFile:
         if not self.has_ranges:
             options = {"headers": {"Accept-Encoding": "identity"}} if self.path.scheme.startswith("http") else {}
             began_s, received = time.monotonic(), 0
-            with asked(self.path, lambda: self._files.open(self._name, block_size=0, **options)) as stream:
-                while piece := asked(self.path, lambda: stream.read(_FETCHED_BYTES), again=False):
+            with ask_server(self.path, lambda: self._files.open(self._name, block_size=0, **options)) as stream:
+                while piece := ask_server(self.path, lambda: stream.read(_FETCHED_BYTES), again=False):
                     received += len(piece)
                     asked(self.path, partial(check_pace, began_s, received), again=False)
                     yield piece
             return
         places = range(0, self.size, _FETCHED_BYTES)
-        for _, piece in ahead(lambda at: self._range(at, _FETCHED_BYTES), places, PIECES_AHEAD, PIECES_AHEAD):
+        for _, piece in work_ahead(lambda at: self._range(at, _FETCHED_BYTES), places, PIECES_AHEAD, PIECES_AHEAD):
             yield piece()
 
     def close(self) -> None:
@@ -336,7 +336,7 @@ def _in_folder(path: UrlPath) -> list[tuple[UrlPath, dict[str, Any]]]:
     """Return the addresses of the files in a folder, and what a store states about them now."""
     files, name = filesystem(path)
     files.invalidate_cache(name)
-    found: list[dict[str, Any]] = asked(path, lambda: files.ls(name, detail=True))
+    found: list[dict[str, Any]] = ask_server(path, lambda: files.ls(name, detail=True))
     return [(_address(files, one["name"], path), one) for one in found]
 
 
@@ -368,7 +368,7 @@ def changed_since(path: UrlPath, inputs: Iterable[InputFile]) -> bool:
     return False
 
 
-def find(path: UrlPath) -> list[UrlPath]:
+def find_logs_at(path: UrlPath) -> list[UrlPath]:
     """Return the logs that an address stands for: itself, what its pattern matches, or the recordings below a folder.
 
     Raises
@@ -409,7 +409,7 @@ def _below(folder: UrlPath) -> list[UrlPath]:
     A folder that is a run is itself.
     """
     files, name = filesystem(folder)
-    names: list[str] = asked(folder, lambda: files.find(name))
+    names: list[str] = ask_server(folder, lambda: files.find(name))
     if f"{name.rstrip('/')}/run.json" in names:
         return [folder]
     bags = {one.rpartition("/")[0] for one in names if one.endswith("/metadata.yaml")}

@@ -185,14 +185,14 @@ class ScratchFolder:
         _clear_dead(folder)
         self.path = folder / f"{_scratch_of_host()}{os.getpid()}-{secrets.token_hex(8)}"
         # before it is there: a signal may come at any time
-        process_resources.begin(self.path)
+        process_resources.mark_unfinished(self.path)
         self.path.mkdir(mode=0o700)
         self._remove = weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
 
     def close(self) -> None:
         """Remove it."""
         self._remove()
-        process_resources.end(self.path)
+        process_resources.mark_finished(self.path)
 
 
 def is_packed(start: bytes) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
-from icrtool.logs.containers.chunk import unaligned
+from icrtool.logs.containers.chunk import values_at_each_byte
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.definitions import (
     COUNTED,
@@ -219,7 +219,7 @@ class Decoder:
             fits[0] = True
             if compare and shape.same is not None:
                 fits = size[left] >= shape.size if shape.readable else size[left] == shape.size
-                together = unaligned(data, np.dtype((np.void, shape.size)))[start[left[fits]]]
+                together = values_at_each_byte(data, np.dtype((np.void, shape.size)))[start[left[fits]]]
                 alike = np.ones(len(together), np.bool_)
                 for at, content in shape.same:
                     alike &= as_first(together, at, len(content))
@@ -298,7 +298,7 @@ class Decoded:
                 row[: len(one)] = one
             # a message that lacks the number may be too near to the end of the data to be read there
             places = np.minimum(self.start[:, None] + table[self.shape_of], len(self.data) - kind.itemsize)
-            values = unaligned(self.data, kind)[places]
+            values = values_at_each_byte(self.data, kind)[places]
         if any(shape.big for shape in self.shapes):
             big = np.array([shape.big for shape in self.shapes])
             values = np.where(big[self.shape_of, None], values.byteswap(), values)
@@ -331,7 +331,7 @@ class Decoded:
                 texts = (
                     self._fields(at, kind)[:, 0]
                     if len(self.shapes) == 1
-                    else unaligned(self.data, kind)[self.start[rows] + at]
+                    else values_at_each_byte(self.data, kind)[self.start[rows] + at]
                 )
                 is_one = bool(as_first(texts, 0, length).all())
                 codes.append(text_numbers(texts[: 1 if is_one else None].tolist(), known))
@@ -348,7 +348,9 @@ class Decoded:
         for shape, rows in self.by_shape():
             at, length = shape.taken[number][0]
             if length:
-                found[rows] = unaligned(self.data, np.dtype((np.void, length)))[self.start[rows] + at].tolist()
+                found[rows] = values_at_each_byte(self.data, np.dtype((np.void, length)))[
+                    self.start[rows] + at
+                ].tolist()
         return list(found)
 
     def by_shape(self) -> Iterator[tuple[Shape, Ints | slice]]:

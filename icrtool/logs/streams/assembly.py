@@ -33,13 +33,13 @@ from icrtool.logs.streams.sources import (
     as_replayed,
     by_header,
     by_log,
-    increasing,
+    increasing_rows,
     replay_speed,
     share_clock,
     stamp_rows,
 )
 from icrtool.logs.streams.wheel_pairs import topic_of_side
-from icrtool.records.notes import Note, about, note
+from icrtool.records.notes import Note, note, notes_about
 from icrtool.records.samples import (
     NO_HEADINGS,
     Datum,
@@ -177,7 +177,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     notes += [note("gyro_in_degrees", f"{one}: its turn rates are in deg/s, not rad/s: converted") for one in degrees]
     log = RobotLog(
         name, wheels, gnss, heading, datum, tuple(streams), survey.inputs, dict(position.rejected),
-        (*survey.problems, *about(name, notes)), antenna, gyro, gyros, tuple(receivers),
+        (*survey.problems, *notes_about(name, notes)), antenna, gyro, gyros, tuple(receivers),
         heading_sensor=None if source is None else _heading_sensor(source, config),
     )  # fmt: skip
     return longest_part(log)
@@ -371,7 +371,7 @@ def _headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[Head
     convention = _heading_sensor(source, config).convention
     why = source.convention_why if config.frames.heading == "auto" else "configured"
     stamps = source.stamps.on(clock)
-    rows, _, _ = increasing(stamps, source.usable)
+    rows, _, _ = increasing_rows(stamps, source.usable)
     samples = HeadingSamples(stamps[rows], source.heading_rad(convention)[rows], source.variance[rows])
     return samples, f"{convention.upper()} ({why})"
 
@@ -407,7 +407,7 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
         stamps = bursts.stamp_ns
         text = bursts.sentence("wheel samples")
         notes += [note("wheel_bursts", f"{topic}: {text}")] if text else []
-    rows, backwards, dropped = increasing(stamps)
+    rows, backwards, dropped = increasing_rows(stamps)
     if backwards:
         notes.append(note("rows_sorted", f"{topic}: {backwards} wheel stamps go back; sorted"))
     if dropped > len(stamps) // 100:
@@ -522,4 +522,4 @@ def longest_part(log: RobotLog) -> RobotLog:
     if lost:
         why = f"more than a day apart from the other samples, and left out: {', '.join(lost)}; if the clock was set, "
         found.insert(0, note("samples_days_apart", f"{why}--from and --to read that part"))
-    return replace(log, notes=(*log.notes, *about(log.name, found)), **parts)
+    return replace(log, notes=(*log.notes, *notes_about(log.name, found)), **parts)

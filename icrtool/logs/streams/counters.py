@@ -146,7 +146,7 @@ def _wraps_of(values: Floats) -> _Wraps | None:
     return _Wraps(moduli, spread, extent, between)
 
 
-def continued(values: NDArray[Any], modulus: float) -> NDArray[Any]:
+def unwrap_counter(values: NDArray[Any], modulus: float) -> NDArray[Any]:
     """Return a counter (n,) without its passages of the modulus; numbers that are not finite stay in their places."""
     steps = np.diff(values[np.isfinite(values)]) if values.dtype.kind == "f" else np.diff(values)
     whole = values.dtype.kind != "f" and float(modulus).is_integer()

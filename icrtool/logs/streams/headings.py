@@ -22,8 +22,8 @@ from icrtool.logs.streams.sources import (
     StampedRows,
     all_valid,
     fields_in,
-    increasing,
-    number,
+    increasing_rows,
+    number_of,
     of_topic,
     stamp_rows,
 )
@@ -41,7 +41,7 @@ class Bearing:
     Attributes
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is
-    angle, std, variance : to rad and rad^2, as `number` reads them; std and variance: either or none. Degrees of 720
+    angle, std, variance : to rad and rad^2, as `number_of` reads them; std and variance: either or none. Degrees of 720
         and more stand for "unknown": Septentrio writes -2e10
     valid : checks, all of which a heading must pass
     convention, known_by : ``ned``: clockwise from north, ``enu``: counter-clockwise from east; how that is known
@@ -65,11 +65,11 @@ class Bearing:
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
         """Return its headings."""
-        angle, variance = number(table, self.angle, needed=True), np.full(len(table), np.nan)
+        angle, variance = number_of(table, self.angle, needed=True), np.full(len(table), np.nan)
         if self.variance:
-            variance = number(table, self.variance)
+            variance = number_of(table, self.variance)
         elif self.std:
-            std = number(table, self.std)
+            std = number_of(table, self.std)
             variance = std * np.abs(std)  # keeps the sign: a deviation that is not positive counts as not stated
         worth = min(self.worth, FUSED_WORTH) if is_fused(table, self.independent) else self.worth
         return replace(self, worth=worth).of(table, angle, variance, all_valid(table, self.valid))
@@ -120,10 +120,10 @@ LEAST_BASELINE_CM = 0.005
 
 def read_baselines(table: TopicTable, _: Config) -> HeadingSource:
     """Return the bearings of the antenna baseline of ublox_msgs/NavRELPOSNED, which states its components."""
-    north, east = (number(table, one, needed=True) for one in _COMPONENTS)
+    north, east = (number_of(table, one, needed=True) for one in _COMPONENTS)
     length = np.hypot(north, east)
     measured = (length > LEAST_BASELINE_CM) & np.isfinite(length)
-    accuracy = np.maximum(*(number(table, one) for one in _ACCURACIES))
+    accuracy = np.maximum(*(number_of(table, one) for one in _ACCURACIES))
     std = np.divide(accuracy, length, out=np.full(len(table), np.nan), where=measured)
     valid = all_valid(table, _BASELINE_VALID) & measured
     return BASELINE.of(table, np.arctan2(east, north), std * np.abs(std), valid)
@@ -360,5 +360,5 @@ def inertial_units(
             sound = np.logical_and.reduce([np.abs(one) * DEGREE <= FASTEST_RADPS for one in rates])
         if np.count_nonzero(~sound) <= MOST_BAD * len(sound) and any(np.ptp(one[sound]) for one in rates):
             stamps = (known.get(table.topic) or stamp_rows(table)).on(clock)
-            rows, _, _ = increasing(stamps, sound)
+            rows, _, _ = increasing_rows(stamps, sound)
             yield table, stamps[rows], [one[rows] for one in rates]

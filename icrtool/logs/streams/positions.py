@@ -15,7 +15,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints, quaternion_product, turned_axis
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import FRAME_FIELD, STAMPS, TopicTable
-from icrtool.logs.streams.sources import NEVER_MOVES, PositionSource, all_valid, fields_in, number, of_topic
+from icrtool.logs.streams.sources import NEVER_MOVES, PositionSource, all_valid, fields_in, number_of, of_topic
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 from icrtool.records.text import LogText
 
@@ -119,7 +119,7 @@ class Fix:
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is as reference
     place : latitude and longitude [deg], height above the ellipsoid [m]; where `metric` x, y, z [m]
-    std : standard deviation [m] to the north and to the east; one text for both. All are read by `number`
+    std : standard deviation [m] to the north and to the east; one text for both. All are read by `number_of`
     covariance : the variances to the north and to the east and their covariance, which have precedence
     stated : checks, all of which a stated covariance must pass
     valid : checks, all of which a fix must pass
@@ -154,8 +154,8 @@ class Fix:
 
         Metric positions of goals, of dead reckoning and of frames whose z is not up are refused.
         """
-        first, second = (number(table, one, needed=True) for one in self.place[:2])
-        third = number(table, self.place[2])
+        first, second = (number_of(table, one, needed=True) for one in self.place[:2])
+        third = number_of(table, self.place[2])
         status_counts = config.topics.gnss_status == "stated"
         no_fix, finite = ~all_valid(table, self.valid) & status_counts, np.isfinite(first) & np.isfinite(second)
         if self.metric:
@@ -202,12 +202,12 @@ class Fix:
         """
         variance = np.full((len(table), 3), np.nan)
         if self.std:
-            north, east = number(table, self.std[0]), number(table, self.std[-1])
+            north, east = number_of(table, self.std[0]), number_of(table, self.std[-1])
             stated = (north > 0) & (east > 0)
             with np.errstate(over="ignore"):
                 variance[stated] = np.column_stack([north**2, east**2, np.zeros(len(table))])[stated]
         if self.covariance:
-            found = np.column_stack([number(table, one) for one in self.covariance])
+            found = np.column_stack([number_of(table, one) for one in self.covariance])
             stated = (found[:, 0] > 0) & (found[:, 1] > 0) & all_valid(table, self.stated)
             variance[stated] = found[stated]
         return variance

@@ -199,7 +199,7 @@ def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
     return header + np.cumsum(moved), clock_set
 
 
-def increasing(stamps: Ints, usable: Bools | None = None) -> tuple[Ints | slice, int, int]:
+def increasing_rows(stamps: Ints, usable: Bools | None = None) -> tuple[Ints | slice, int, int]:
     """Return the usable rows that make stamps strictly increasing, how many went back, and how many were equal.
 
     Rows are sorted by stamp; of rows with the same stamp the last one stays. All rows in their order are a slice, which
@@ -207,7 +207,7 @@ def increasing(stamps: Ints, usable: Bools | None = None) -> tuple[Ints | slice,
     """
     if usable is not None and not usable.all():
         rows = np.flatnonzero(usable)
-        kept, backwards, equal = increasing(stamps[rows])
+        kept, backwards, equal = increasing_rows(stamps[rows])
         return rows[kept], backwards, equal
     steps = np.diff(stamps)
     if (steps > 0).all():
@@ -348,12 +348,12 @@ def motion_of(
     changes = any(float(np.ptp(side[np.isfinite(side)])) > 0.0 for side in travelled or ())
     if travelled is None and speeds is None and twist is None:
         problem = problem or "has neither position nor speed of both sides"
-    elif not changes and not any(moves(values) for values in (*(speeds or ()), twist) if values is not None):
+    elif not changes and not any(wheels_move(values) for values in (*(speeds or ()), twist) if values is not None):
         score, why = score - NEVER_MOVES, f"{why}, never moves"
     return WheelSource(position=travelled, speed=speeds, twist=twist, score=score, why=why, problem=problem, **others)
 
 
-def moves(speeds: Floats) -> bool:
+def wheels_move(speeds: Floats) -> bool:
     """Return whether any finite speed is not 0."""
     return bool(np.any(speeds[np.isfinite(speeds)] != 0.0))
 
@@ -388,7 +388,7 @@ def terms_of(text: str) -> list[tuple[list[str], float, float]]:
     return terms
 
 
-def number(table: TopicTable, text: str, *, needed: bool = False) -> Floats:
+def number_of(table: TopicTable, text: str, *, needed: bool = False) -> Floats:
     """Return the values (n,) of a number as a text describes it; NaN where unknown, or where the type lacks it.
 
     The term after a plus is added where it is known: further digits, or the height of the geoid.

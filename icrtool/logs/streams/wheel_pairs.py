@@ -20,10 +20,17 @@ from icrtool.logs.messages.decoded_values import number_fields
 from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.bursts import spread_bursts
-from icrtool.logs.streams.counters import TURN_MODULI, Modulus, continued, find_modulus, register_size
+from icrtool.logs.streams.counters import TURN_MODULI, Modulus, find_modulus, register_size, unwrap_counter
 from icrtool.logs.streams.message_types import KNOWN_TYPES
 from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, share_clock, stamp_rows
-from icrtool.logs.streams.wheels import COMMAND_NOTES, COMMANDED, COMMANDED_PENALTY, MOST_WHEELS, WHEEL_WORDS, elements
+from icrtool.logs.streams.wheels import (
+    COMMAND_NOTES,
+    COMMANDED,
+    COMMANDED_PENALTY,
+    MOST_WHEELS,
+    WHEEL_WORDS,
+    column_and_places,
+)
 from icrtool.records.notes import note
 from icrtool.records.samples import OWN_TWIST, WheelUnit
 from icrtool.records.text import LogText
@@ -99,7 +106,7 @@ class Side:
         DefinitionError
             The messages have no such field or element.
         """
-        column, places = elements(self.path)
+        column, places = column_and_places(self.path)
         values = self.table.column(column)
         if not places:
             return [values]
@@ -163,7 +170,7 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
         for topic, _, path in (name.partition(".") for name in named.values()):
             for channel in channels:
                 if channel.topic == topic:
-                    found[channel.id].add(elements(path or "data")[0])
+                    found[channel.id].add(column_and_places(path or "data")[0])
         return found
     names: dict[str, dict[str, list[tuple[int, str]]]] = {}
     search = _Search()
@@ -386,7 +393,7 @@ def _unwrapped(values: NDArray[Any], modulus: Modulus | None) -> NDArray[Any]:
     if not len(values) or (modulus is None and values.dtype.kind == "f"):
         return values
     size = modulus.value if modulus is not None else register_size(values)
-    return values if size is None else continued(values, size)
+    return values if size is None else unwrap_counter(values, size)
 
 
 def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: bool) -> bool:

@@ -17,7 +17,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, unwrapped
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import LARGEST_PLACE_M, REFERENCE_WORDS
-from icrtool.logs.streams.sources import NEVER_MOVES, Sides, WheelSource, motion_of, moves, of_topic
+from icrtool.logs.streams.sources import NEVER_MOVES, Sides, WheelSource, motion_of, of_topic, wheels_move
 from icrtool.records.notes import Note, note
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import listed
@@ -102,7 +102,7 @@ def unwound_turns(position: Floats) -> Floats:
 _ELEMENTS = re.compile(r"\[([\d,]+)\]")
 
 
-def elements(path: str) -> tuple[str, list[int]]:
+def column_and_places(path: str) -> tuple[str, list[int]]:
     """Return the column that holds a field, and the places in it: ``data[0,2]`` is of ``data[*]``."""
     found = _ELEMENTS.search(path)
     places = [int(place) for place in found[1].split(",") if place] if found is not None else []
@@ -130,7 +130,7 @@ class FixedWheels:
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        return tuple(elements(path)[0] for path in (*self.position, *self.speed))
+        return tuple(column_and_places(path)[0] for path in (*self.position, *self.speed))
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
         """Return the motion of both sides.
@@ -144,7 +144,7 @@ class FixedWheels:
 
         def wheels_of(quantity: Quantity) -> list[NDArray[Any]]:
             wheels: list[NDArray[Any]] = []
-            for column, places in map(elements, paths[quantity]):
+            for column, places in map(column_and_places, paths[quantity]):
                 values = table.find(column)
                 if values is None:
                     return []
@@ -153,7 +153,7 @@ class FixedWheels:
                 wheels += [values[:, place] * self.factor for place in places] or [values * self.factor]
             return wheels
 
-        lefts, rights = (len(elements(path)[1]) or 1 for path in self.position or self.speed)
+        lefts, rights = (len(column_and_places(path)[1]) or 1 for path in self.position or self.speed)
         names = [f"wheel {i}" for i in range(lefts + rights)]
         return of_wheels(wheels_of, lefts, names, self.unit, **of_topic(table), score=self.worth, why=self.what)
 
@@ -257,7 +257,7 @@ class Twist:
         if COMMANDED.search(table.topic):
             score, why, known = score - COMMANDED_PENALTY, f"{why} (commanded)", COMMAND_NOTES
         problem = ""
-        if not moves(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
+        if not wheels_move(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
             problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
         elif self.fused and REFERENCE_WORDS.search(table.topic):
             problem = "its name is the name of a position reference, not of wheels"
@@ -289,7 +289,7 @@ class Odometry(Twist):
     def read(self, table: TopicTable, _: Config) -> WheelSource:
         """Return the twist; where it stays 0 while the pose moves, the distance and the turn of the pose."""
         found = self.of_twist(table)
-        if found.twist is None or moves(found.twist) or not all(path in table.columns for path in ODOMETRY_POSE):
+        if found.twist is None or wheels_move(found.twist) or not all(path in table.columns for path in ODOMETRY_POSE):
             return found
         travelled = travelled_by(*(table.floats(path) for path in ODOMETRY_POSE))
         if travelled is None:

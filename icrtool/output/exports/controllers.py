@@ -21,7 +21,7 @@ from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import controller_error_text
 from icrtool.records.calibration_document import ControllerErrors
 from icrtool.records.choices import ControllerTarget
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.run import ICR_COLUMNS
 
 CONTROLLER_TARGETS: tuple[ControllerTarget, ...] = get_args(ControllerTarget)
@@ -241,7 +241,7 @@ def format_twist(calibration: Calibration) -> str:
         "schema": TWIST_SCHEMA,
         "tool_version": __version__,
         "created": calibration.created or "",
-        "robot": plain(calibration.robot),
+        "robot": plain_value(calibration.robot),
         "frame": "REP-103: x forward, y left, yaw counter-clockwise",
         "inputs": "v_left, v_right [m/s]: wheel speeds at the configured radius, forward positive",
         "outputs": "v_x, v_y [m/s], yaw_rate [rad/s]",
@@ -264,7 +264,7 @@ def format_twist(calibration: Calibration) -> str:
             "x_icr_m": geometry["x_icr_m"], "std": {name: stds[name] for name in ICR_COLUMNS},
         },
         "held_out": {"horizon_m": POSE_AFTER_M, "p95_m": p95, "expected_m": expected},
-        "logs": plain(calibration.logs),
+        "logs": plain_value(calibration.logs),
         "warnings": list(calibration.warnings),
     }  # fmt: skip
     return json_bytes(document).decode().rstrip("\n")

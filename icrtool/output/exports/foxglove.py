@@ -34,7 +34,7 @@ from icrtool.output.exports.paths import (
     rows_apart,
 )
 from icrtool.output.files.atomic import EXPORTED_MCAP
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.samples import FIXED_FIX
 
@@ -117,7 +117,7 @@ def write_foxglove(run: Run, path: Path) -> None:
     ]
     topics = [write_log.serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
     topics += [_whole_path(path, store) for path in paths]
-    slip = ({**plain(event), "x_m": event.east_m, "y_m": event.north_m} for event in run.document.events)
+    slip = ({**plain_value(event), "x_m": event.east_m, "y_m": event.north_m} for event in run.document.events)
     outages: list[dict[str, Any]] = []
     for (begin_ns, end_ns), span in outage_rows(run):
         x_m, y_m, distance = run.table.east_m[span], run.table.north_m[span], run.table.distance_m[span]

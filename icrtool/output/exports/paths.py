@@ -29,7 +29,7 @@ from icrtool.kernels.track import FrozenIcrs
 from icrtool.output.series import BLUE, ORANGE, places
 from icrtool.output.text_format import PATH_WORDS, driven_text, duration_text, run_title, xml_text
 from icrtool.records.choices import TrajectoryFormat
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import States
 from icrtool.records.text import distance_text
@@ -222,10 +222,10 @@ def format_geojson(run: Run) -> str:
         *_event_features(run, globe),
     ]
     document = {"type": "FeatureCollection", "name": run.name, "icrtool": about_run(run), "features": features}
-    return orjson.dumps(plain(document)).decode()
+    return orjson.dumps(plain_value(document)).decode()
 
 
-def coordinates(x_m: Floats, y_m: Floats, globe: Globe) -> list[list[float]]:
+def coordinates_of(x_m: Floats, y_m: Floats, globe: Globe) -> list[list[float]]:
     """Return longitude and latitude [deg] of points (n,) east and north of the datum."""
     latitude, longitude = globe.places(x_m, y_m)
     pairs: list[list[float]] = np.round(np.column_stack([longitude, latitude]), DEGREE_DIGITS).tolist()
@@ -235,13 +235,13 @@ def coordinates(x_m: Floats, y_m: Floats, globe: Globe) -> list[list[float]]:
 def _line(layer: str, x_m: Floats, y_m: Floats, globe: Globe, properties: dict[str, Any]) -> Feature:
     """Return a line, thinned."""
     rows = line_rows(x_m, y_m)
-    geometry = {"type": "LineString", "coordinates": coordinates(x_m[rows], y_m[rows], globe)}
+    geometry = {"type": "LineString", "coordinates": coordinates_of(x_m[rows], y_m[rows], globe)}
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer} | properties}
 
 
 def _points(layer: str, x_m: Floats, y_m: Floats, globe: Globe, columns: dict[str, list[Any]]) -> Iterator[Feature]:
     """Yield a point for each row; `columns` are its attributes."""
-    for pair, values in zip(coordinates(x_m, y_m, globe), zip(*columns.values(), strict=True), strict=True):
+    for pair, values in zip(coordinates_of(x_m, y_m, globe), zip(*columns.values(), strict=True), strict=True):
         properties = {"layer": layer, **dict(zip(columns, values, strict=True))}
         yield {"type": "Feature", "geometry": {"type": "Point", "coordinates": pair}, "properties": properties}
 
@@ -299,7 +299,7 @@ def _fix_features(run: Run, globe: Globe) -> Iterator[Feature]:
 
 def _event_features(run: Run, globe: Globe) -> Iterator[Feature]:
     """Yield a point for each slip event."""
-    for event in plain(run.document.events):
+    for event in plain_value(run.document.events):
         east, north = np.array([event.pop("east_m")]), np.array([event.pop("north_m")])
         begin = utc_text(np.array([event["begin_ns"]], np.int64))
         yield from _points(
@@ -402,7 +402,7 @@ def _track(path: ExportPath, globe: Globe) -> ET.Element:
         *(_element("when", time) for time in utc_text(path.stamp_ns[rows])),
         *(
             _element(f"{{{GX}}}coord", f"{east:.9f} {north:.9f} 0")
-            for east, north in coordinates(path.x_m[rows], path.y_m[rows], globe)
+            for east, north in coordinates_of(path.x_m[rows], path.y_m[rows], globe)
         ),
         *(_element(f"{{{GX}}}angles", f"{heading_deg:.1f} 0 0") for heading_deg in headings_deg),
     )

@@ -183,7 +183,7 @@ LEAST_LABELS_IN, CHARACTER_IN = 2.0, 0.076
 SURE_LOOK: style.Look = {"marker": "o", "markersize": 5.0, "color": style.ICR["color"], "linestyle": "none",
                          "elinewidth": 1.8, "capsize": 2.5}  # fmt: skip
 CHANCE_LOOK: style.Look = SURE_LOOK | {"markerfacecolor": "white", "color": "0.35", "elinewidth": 1.2}
-ALONE_LOOK: style.Look = style.spot("white", 6.0, "X", "0.35")
+ALONE_LOOK: style.Look = style.spot_look("white", 6.0, "X", "0.35")
 """Looks of a difference that is shown, of one that may be chance, and of one without an interval."""
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 PANEL_HEIGHT_IN, LOW_PANEL_IN = 2.0, 1.45
 
-P95 = style.line("black", width=1.2)
+P95 = style.line_look("black", width=1.2)
 """Line of the 95 % mark: solid in every picture; the expected value is dashed (`MEAN`)."""
 
 THIN = 0.9
@@ -47,7 +47,7 @@ BAR_STEP = 0.009
 
 TITLE_CHARACTERS = int(style.TITLE_CHARACTERS_PER_INCH * style.WIDTH_IN)
 
-END_LINE = style.line("0.45", (0, (1.0, 2.0)), 1.0)
+END_LINE = style.line_look("0.45", (0, (1.0, 2.0)), 1.0)
 UNIT_SPACE = re.compile(r"(\d) m\b")
 END_CHARACTERS = 30
 """Characters in a line of the text where lines and bands end."""
@@ -109,7 +109,7 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     if bars:
         axes.errorbar([], [], [], label="other 95 % intervals", **BAR_LOOK | {"color": "0.35"})
     if outages:
-        look = style.spot("black", 7.0, "X") | {"zorder": 5, "label": "real outage"}
+        look = style.spot_look("black", 7.0, "X") | {"zorder": 5, "label": "real outage"}
         axes.plot(column_of(outages, "distance_m"), column_of(outages, "end_error_m"), **look)
     # The scale holds all errors from the first horizon on, over at most `MOST_DECADES`, and the band where it is near.
     drawn = [*(one.column("p95_m") for one in models), first.column("expected_error_m")]
@@ -308,7 +308,7 @@ def _mark_reaches(
     for one in reached:
         pen = pens[one.model]
         axes.plot([one.distance_m] * 2, [lowest_m, one.budget_m], color=pen["color"], linewidth=0.7, zorder=1.5)
-        axes.plot([one.distance_m], [one.budget_m], zorder=5, **style.spot("white", color=pen["color"]))
+        axes.plot([one.distance_m], [one.budget_m], zorder=5, **style.spot_look("white", color=pen["color"]))
         lines.append((np.full(2, one.distance_m), np.array([lowest_m, one.budget_m])))
         lines.append((np.array(axes.get_xlim()), np.full(2, one.budget_m)))
     labels = [

@@ -42,8 +42,11 @@ WORST_CELL_IN = 2.15
 WORST_LAYOUT: Any = {"margins_in": (0.15, 0.15, 0.98, 0.5), "wspace": 0.12, "hspace": 0.27}
 CELL_TITLE: style.Look = {"loc": "left", "pad": 4.0, "fontsize": 8.5}
 
-OUTAGES = {"forced": style.line(style.BAD_FIX_COLOR, width=1.8), "real": style.line("black", (0, (2.0, 1.2)), 1.8)}
-PATH = style.line(style.FIX_COLOR, width=1.4)
+OUTAGES = {
+    "forced": style.line_look(style.BAD_FIX_COLOR, width=1.8),
+    "real": style.line_look("black", (0, (2.0, 1.2)), 1.8),
+}
+PATH = style.line_look(style.FIX_COLOR, width=1.4)
 
 NO_BREAK = "\N{NO-BREAK SPACE}"
 
@@ -137,7 +140,7 @@ def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, 
     cell = look_down(axes, north_m, east_m, margin=0.12, ticks=0)
     draw_path(axes, north_m, east_m, cell, PATH, zorder=2)
     starts = [(trial.east_m, trial.north_m) for trial in worst]
-    axes.plot(*zip(*starts, strict=True), zorder=3, **style.spot("white", 4.0))
+    axes.plot(*zip(*starts, strict=True), zorder=3, **style.spot_look("white", 4.0))
     labels = [Label(str(rank), *place) for rank, place in enumerate(starts, start=1)]
     write_labels(axes, labels, [(east_m, north_m)], crossing=True, fontweight="bold")
     _draw_scale(axes)
@@ -201,7 +204,7 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
         draw_path(axes, one.north_m, one.east_m, cell, OUTAGES[kind], zorder=3, label=f"{kind} outage")
     for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
         ends = [(one.east_m[row], one.north_m[row]) for one in outages]
-        axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **style.spot(fill))
+        axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **style.spot_look(fill))
     # Number and end error near the end of each outage where there is space; the tables hold all of them.
     labels = [
         Label(f"{number}: {error_text(one.document.end_error_m)}", float(one.east_m[-1]), float(one.north_m[-1]))
@@ -245,7 +248,7 @@ LIGHTEST = 0.08
 ERROR_STEPS = 7.0
 """Approximate number of steps of the colours. An error is read from a step, not from a gradient."""
 
-UNSCORED = style.line("0.80", width=1.0)
+UNSCORED = style.line_look("0.80", width=1.0)
 ERROR_LINE_PT = 3.4
 MOST_OF_P95 = 1.5
 """Largest ratio of the end of the colours to the 95 % error. Larger errors have the last colour."""
@@ -318,7 +321,7 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
     worst = [(trial.document.east_m, trial.document.north_m) for trial in report.worst[:MARKED_WORST]]
     if worst:
         label = f"the worst {len(worst)} that do not overlap" if len(worst) > 1 else "the worst"
-        axes.plot(*zip(*worst, strict=True), zorder=5, label=label, **style.spot("none", 9.0, color="black"))
+        axes.plot(*zip(*worst, strict=True), zorder=5, label=label, **style.spot_look("none", 9.0, color="black"))
         labels = [
             Label(f"{rank}: {error_text(trial.document.errors_m[trial.document.model])}", *at)
             for rank, (at, trial) in enumerate(zip(worst, report.worst, strict=False), start=1)
@@ -347,11 +350,11 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, ticks: i
     lines = [(north - trial.north_m, east - trial.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
     cell = look_down(axes, norths, easts, ticks=ticks)
-    axes.plot([0.0], [0.0], zorder=6, label="start", **style.spot("white"))
+    axes.plot([0.0], [0.0], zorder=6, label="start", **style.spot_look("white"))
     for order, (north, east, pen, label) in enumerate(lines):
         draw_path(axes, north, east, cell, pen, zorder=2 + min(order, 1), label=label)
     for north, east, pen, _ in lines:
-        look = style.spot(pen["color"], 4.5, "D", pen["color"])
+        look = style.spot_look(pen["color"], 4.5, "D", pen["color"])
         axes.plot(east[-1:], north[-1:], zorder=5, label="where each ends", **look)
     end_s = trial.t_s + trial.horizon_m / max(trial.speed_mean_mps, SLOWEST_SHOWN_MPS)
     for one in report.outages:

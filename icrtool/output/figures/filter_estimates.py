@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-SEGMENT = style.line(ORANGE, width=1.6)
+SEGMENT = style.line_look(ORANGE, width=1.6)
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 """Places of the ICRs without slip, in half track widths."""
 
@@ -156,7 +156,7 @@ def _draw_estimate(
         marks = ("white", "10 %"), ("black", "90 %: converged")
         for second, (fill, label) in zip(run.convergence_s[column] or (), marks, strict=False):
             spread.append(float(getattr(table, column)[np.searchsorted(table.t_s, second)]))
-            axes.plot([second / unit], spread[-1:], zorder=4, clip_on=False, label=label, **style.spot(fill))
+            axes.plot([second / unit], spread[-1:], zorder=4, clip_on=False, label=label, **style.spot_look(fill))
         if run.track_width_m is not None:
             spread.append(SIDES[column] * run.track_width_m / 2)
             axes.axhline(spread[-1], **NO_SLIP_PLACE)

@@ -90,7 +90,7 @@ same."""
 NEARLY_WHITE = 252
 
 
-def line(color: str, dash: str | tuple[float, tuple[float, ...]] = "-", width: float = 1.3) -> Look:
+def line_look(color: str, dash: str | tuple[float, tuple[float, ...]] = "-", width: float = 1.3) -> Look:
     """Return the look of a line: dash and luminance distinguish it on a grey print."""
     return {"color": color, "linestyle": dash, "linewidth": width}
 
@@ -101,13 +101,13 @@ BAD_FIX_COLOR = RED
 OUTAGE_COLOR = "0.90"
 BAR_COLOR = "#5b8db8"
 BAND_COLOR = "#a6c4e0"
-FILTER = line("black", width=1.1)
-ICR = line(BLUE, (0, (6, 2)), 1.5)
-NO_SLIP_LINE = line(ORANGE, (0, (6, 1.5, 1.2, 1.5)), 1.5)
-HALF_WIDTH = line("0.35", (0, (1.5, 2.0)), 1.1)
-CHANGE_LINE = line(RED, (0, (3, 1.5)), 1.1)
-MEAN = line("black", (0, (5, 2)), 1.1)
-BUDGET = line(RED, (0, (1.5, 2.0)), 1.2)
+FILTER = line_look("black", width=1.1)
+ICR = line_look(BLUE, (0, (6, 2)), 1.5)
+NO_SLIP_LINE = line_look(ORANGE, (0, (6, 1.5, 1.2, 1.5)), 1.5)
+HALF_WIDTH = line_look("0.35", (0, (1.5, 2.0)), 1.1)
+CHANGE_LINE = line_look(RED, (0, (3, 1.5)), 1.1)
+MEAN = line_look("black", (0, (5, 2)), 1.1)
+BUDGET = line_look(RED, (0, (1.5, 2.0)), 1.2)
 COLORS: dict[Color, str] = {
     "green": GREEN, "purple": PURPLE, "blue": BLUE, "orange": ORANGE, "grey": "#666666", "brown": "#8c510a",
     "pink": "#c51b7d", "teal": "#01665e", "olive": "#7a7a00", "slate": "#5c6f8a",
@@ -168,7 +168,7 @@ def new_figure(
     return figure
 
 
-def spot(fill: str, size: float = 5.5, marker: str = "o", color: str = "black") -> Look:
+def spot_look(fill: str, size: float = 5.5, marker: str = "o", color: str = "black") -> Look:
     """Return the look of a place: white where something begins, black where it ends."""
     return {"linestyle": "none", "marker": marker, "color": color, "markerfacecolor": fill, "markersize": size}
 
@@ -224,7 +224,7 @@ def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
 def row_pens(names: Iterable[str]) -> dict[str, Look]:
     """Return how the rows of a report are drawn, by name, in their order."""
     rows = rows_of(names).items()
-    return {name: line(COLORS[row.color], DASHES[row.dash], ROW_WIDTH * row.width) for name, row in rows}
+    return {name: line_look(COLORS[row.color], DASHES[row.dash], ROW_WIDTH * row.width) for name, row in rows}
 
 
 def logarithmic_errors(axes: Axes, of: Literal["x", "y"] = "x") -> None:

@@ -60,7 +60,7 @@ FIX_LOOKS: dict[int, style.Look] = {
     FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": style.FLOAT_COLOR},
     OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
 }
-SLIP_LOOK: style.Look = style.spot("none", 6.5, "D", style.FLOAT_COLOR) | {"markeredgewidth": 1.6, "zorder": 4.6}
+SLIP_LOOK: style.Look = style.spot_look("none", 6.5, "D", style.FLOAT_COLOR) | {"markeredgewidth": 1.6, "zorder": 4.6}
 REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
 """Marker of rejected fixes. Shape and luminance distinguish the markers of all classes."""
 
@@ -123,8 +123,8 @@ def trajectory(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
             east, north = table.east_m[rows], table.north_m[rows]
             axes.plot(east, north, color=style.FLOAT_COLOR, linewidth=3.0, zorder=4.5)
             axes.plot(east[:1], north[:1], label="slip event", **SLIP_LOOK)
-    axes.plot(table.east_m[:1], table.north_m[:1], zorder=5, label="start", **style.spot("white", 8.0))
-    axes.plot(table.east_m[-1:], table.north_m[-1:], zorder=5, label="end", **style.spot("black", 6.0))
+    axes.plot(table.east_m[:1], table.north_m[:1], zorder=5, label="start", **style.spot_look("white", 8.0))
+    axes.plot(table.east_m[-1:], table.north_m[-1:], zorder=5, label="end", **style.spot_look("black", 6.0))
     _write_times(axes, run, cell, drawn)
     name_directions(axes, run.document)
     sheet.legend(ncols=2, columnspacing=3.0)
@@ -198,7 +198,7 @@ CELLS_A_VIEW = 1500.0
 """Number of cells across the view. Points in one cell, about a pixel, are drawn as one point."""
 
 
-JUMP_LOOK: style.Look = style.spot("none", 6.0, "s", style.BAD_FIX_COLOR) | {"zorder": 4.4}
+JUMP_LOOK: style.Look = style.spot_look("none", 6.0, "s", style.BAD_FIX_COLOR) | {"zorder": 4.4}
 """Marker of a jump of the position reference."""
 
 

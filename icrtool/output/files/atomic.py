@@ -25,7 +25,7 @@ from zlib import crc32
 
 from icrtool.errors import OutputError
 from icrtool.records.places import Below, Place, open_regular, path_of
-from icrtool.records.process_resources import begin, end, remove, unfinished
+from icrtool.records.process_resources import mark_finished, mark_unfinished, remove_path, unfinished
 
 IsOurFile = Callable[[bytes], bool]
 """Whether icrtool wrote a file and may replace it, by the first bytes of the file."""
@@ -146,7 +146,7 @@ def atomic_file(file: Place, ours: IsOurFile | None = None) -> Iterator[Path]:
     with place_errors(file), partial_at(_target_of(file, ours), Path.touch) as partial:
         yield partial
         sync(partial)
-        put(partial, _target_of(file, ours))
+        put_in_place(partial, _target_of(file, ours))
 
 
 def write_file(file: Place, content: str | bytes, ours: IsOurFile | None = None) -> None:
@@ -271,7 +271,7 @@ def atomic_directory(directory: Place, kind: Kind) -> Iterator[Path]:
             yield partial
             sync_tree(partial)
             check_directory(directory, kind)
-            put(partial, place)
+            put_in_place(partial, place)
 
 
 @contextmanager
@@ -291,7 +291,7 @@ def partial_at(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
             make(partial)
             yield partial
         finally:
-            remove(partial)
+            remove_path(partial)
 
 
 def _hidden_name(place: Path, writer: str, suffix: str = "") -> str:
@@ -318,7 +318,7 @@ def has_process(stated: str) -> bool:
     return Path("/proc", number).exists()
 
 
-def put(partial: Path, place: Path) -> None:
+def put_in_place(partial: Path, place: Path) -> None:
     """Put a synced hidden file or directory in its place; `partial_at` removes the old one.
 
     Raises
@@ -327,7 +327,7 @@ def put(partial: Path, place: Path) -> None:
         It cannot be renamed. The old file or directory is then unchanged.
     """
     # If this process is killed, the old directory must not be removed under its hidden name.
-    end(partial)
+    mark_finished(partial)
     if not place.is_dir():
         partial.replace(place)
     elif not _exchange(partial, place):
@@ -338,10 +338,10 @@ def put(partial: Path, place: Path) -> None:
         finally:
             # An interruption, or an error of a network file system, may come after the rename.
             if place.exists():
-                remove(old)
+                remove_path(old)
             else:
                 old.rename(place)
-    begin(partial)
+    mark_unfinished(partial)
     sync(place.parent)
 
 

@@ -25,7 +25,7 @@ from icrtool.output.files.atomic import check_place, write_file
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationFile
 from icrtool.records.fleet_document import FLEET_FILE, FleetDocument, FleetLog
 from icrtool.records.places import Below, Place, open_regular, path_of, read_regular
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.text import LogText, escaped_texts, table_cell
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def read_document(file: Place, kind: type[Document], *, escape: bool = True) -> 
 
 def json_bytes(document: msgspec.Struct | Mapping[str, object]) -> bytes:
     """Return the JSON text of a file: indented, UTF-8, null for a number that is not finite."""
-    text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_as_in_the_log(plain_value(document)), indent=2, ensure_ascii=False, allow_nan=False)
     # A file name with lone surrogates, which UTF-8 cannot hold, is written with JSON escapes.
     return (text + "\n").encode("utf-8", errors="backslashreplace")
 

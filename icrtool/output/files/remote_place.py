@@ -125,7 +125,7 @@ def lies_there(place: UrlPath, name: str) -> bool:
     if place.scheme.startswith("http"):
         return False
     files, path = filesystem(place / name)
-    return bool(asked(place, lambda: files.exists(path)))
+    return bool(ask_server(place, lambda: files.exists(path)))
 
 
 class _Store:
@@ -320,7 +320,7 @@ class _Store:
     def _done(self, request: Callable[[], Result]) -> Result:
         """Return the answer to a request."""
         with place_errors(self._place), _as_output(self._place):
-            return asked(self._place, request, done=self._what_is_done)
+            return ask_server(self._place, request, done=self._what_is_done)
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from icrtool.records.measurements import Fixes, ReferenceJump, SensorData, SlipE
 from icrtool.records.places import Below, Place, open_regular, path_of
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
-from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, thin
+from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, without_repeats
 from icrtool.records.tables import LARGEST_STATE, States
 
 if TYPE_CHECKING:
@@ -322,7 +322,7 @@ def read_measurements(
         attitude = None
         if "attitude_stamp_ns" in columns:
             attitude = HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
-            attitude = replace(attitude, var_rad2=thin(attitude.var_rad2))
+            attitude = replace(attitude, var_rad2=without_repeats(attitude.var_rad2))
         sensors = SensorData(
             name=document.log,
             wheels=WheelSamples(stamps, left, right),

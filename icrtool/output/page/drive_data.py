@@ -39,7 +39,7 @@ from icrtool.output.series import (
     scale_end_m,
     scale_of,
 )
-from icrtool.output.tables.errors import ordered
+from icrtool.output.tables.errors import in_row_order
 from icrtool.records.dropout_document import DropoutDocument, FitDocument
 from icrtool.records.plain_data import Record
 from icrtool.records.rows import REST_OF_DRIVE, Row, rows_of, shown_rows
@@ -100,7 +100,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
 
 def errors_data(report: DropoutDocument) -> dict[str, object]:
     """Return the errors over distance by model, and the errors of the reference alone."""
-    models = ordered(report.models)
+    models = in_row_order(report.models)
     rows = rows_of(one.name for one in models)
     shown_names = shown_rows(list(rows))
     reference = report.reference_error
@@ -151,8 +151,8 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
     return {
         "step": packed_sums(rows, unit=1),
         "t": packed_sums(table.t_s[state]),
-        "heading": packed(wrapped(table.heading_rad[state])),
-        **{name: packed(column[rows]) for name, column in values.items()},
+        "heading": pack_column(wrapped(table.heading_rad[state])),
+        **{name: pack_column(column[rows]) for name, column in values.items()},
         **{name: packed_levels(column[state]) for name, column in speeds.items()},
         **{f"std_{name}": packed_levels(icr_std_m(run, column)[state]) for name, column in icrs.items()},
     }
@@ -164,7 +164,7 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
     data: dict[str, object] = {"top_m": scale_end_m(difference[run.gnss.used])}
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
         rows, differences = _differences(run.gnss, chosen, difference)
-        north, east = packed(fixes.north_m[rows] - origin[0]), packed(fixes.east_m[rows] - origin[1])
+        north, east = pack_column(fixes.north_m[rows] - origin[0]), pack_column(fixes.east_m[rows] - origin[1])
         data[name] = differences | {"north": north, "east": east}
     return data
 
@@ -177,7 +177,7 @@ def _differences(outcome: MeasurementOutcome, chosen: Bools, difference: Floats)
     after = breaks_after(used_s)
     breaks = (used_s[after] + used_s[after + 1]) / 2
     rows = rows[extremes(difference[rows], points=FIX_POINTS)]
-    columns = {"t": packed(t_s[rows]), "difference": packed(difference[rows])}
+    columns = {"t": pack_column(t_s[rows]), "difference": pack_column(difference[rows])}
     return rows, {**columns, "breaks_s": breaks.tolist()}
 
 
@@ -305,7 +305,7 @@ class Column(Record, frozen=True, kw_only=True):
     first: float | UnsetType = UNSET
 
 
-def packed(column: Floats) -> Column:
+def pack_column(column: Floats) -> Column:
     """Return a column (n,) for a page.
 
     Notes

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from icrtool import __version__
 from icrtool.errors import RunError
-from icrtool.output.text_blocks import Block, stated
+from icrtool.output.text_blocks import Block, stated_blocks
 from icrtool.records.places import Below, read_regular
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
@@ -71,12 +71,12 @@ def render(
         f"script-src {' '.join(of_scripts)}; base-uri 'none'; form-action 'none'"
     )
     # JSON with any text that is safe in a script element.
-    written = json.dumps(plain(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
+    written = json.dumps(plain_value(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
     return _environment().get_template("base.html").render(
         # Texts of icrtool, not of a log: they are not escaped.
         policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(one) for one in code[1:]],  # noqa: S704
         data=None if data is None else Markup(written),  # noqa: S704 - escaped for a script element
-        tool_version=__version__, title=title, kind=kind, blocks=list(stated(blocks)),
+        tool_version=__version__, title=title, kind=kind, blocks=list(stated_blocks(blocks)),
         **{"pictures": {}, **content},
     )  # fmt: skip
 

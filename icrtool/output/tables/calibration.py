@@ -32,7 +32,7 @@ from icrtool.output.text_format import controller_error_text, error_text, model_
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.fleet_document import BUDGET_M
-from icrtool.records.plain_data import known
+from icrtool.records.plain_data import finite_or_none
 from icrtool.records.rows import MAIN_ROW, in_order, shown_rows
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.text import counted, distance_text, with_interval, with_std
@@ -284,7 +284,11 @@ def forecast_document(
     """Return the document that ``icrtool forecast --json`` prints."""
     columns = {name: column.tolist() for name, column in _columns(forecast, gyro).items()}
     reaches = [
-        (metres, known(reach(forecast, metres)), UNSET if gyro is None else known(reach(gyro, metres)))
+        (
+            metres,
+            finite_or_none(distance_within(forecast, metres)),
+            UNSET if gyro is None else finite_or_none(distance_within(gyro, metres)),
+        )
         for metres in budgets_m
     ]
     return documents.ForecastDocument(
@@ -307,7 +311,7 @@ def measured_to_m(calibration: Calibration) -> float:
     return 0.0 if calibration.error_sources is None else calibration.error_sources.measured_to_m
 
 
-def reach(forecast: Forecast, budget_m: float) -> float:
+def distance_within(forecast: Forecast, budget_m: float) -> float:
     """Return the distance [m] up to which 95 % of the errors stay within a budget."""
     reached = within_budget(forecast.distance_m, forecast.p95_m, budget_m)
     return math.nan if reached is None else reached[0]
@@ -333,7 +337,7 @@ def forecast_blocks(
         "",
     ]
     for budget in budgets_m:
-        far = [(kind, reach(one, budget)) for kind, one in kinds]
+        far = [(kind, distance_within(one, budget)) for kind, one in kinds]
         reached = [f"{'all of it' if metres >= total else f'{metres:.1f} m'}{kind}" for kind, metres in far]
         blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
     if total > (longest := measured_to_m(calibration)):

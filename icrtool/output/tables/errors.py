@@ -49,7 +49,7 @@ def model_of(report: DropoutDocument, name: str) -> ModelDocument | None:
     return next((one for one in report.models if one.name == name), None)
 
 
-def ordered(models: Sequence[ModelDocument]) -> list[ModelDocument]:
+def in_row_order(models: Sequence[ModelDocument]) -> list[ModelDocument]:
     """Return models of a report in the order of `icrtool.records.rows`."""
     by_name = {one.name: one for one in models}
     return [by_name[name] for name in in_order(by_name)]
@@ -66,7 +66,7 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     """Return the errors over distance: what counts first, then all of them, and what they rest on."""
     horizons = shown_horizons(np.array([row.horizon_m for row in report.trials]))
     counts = [report.trials[h] for h in horizons]
-    main, models = shown_rows([one.name for one in report.models]), ordered(report.models)
+    main, models = shown_rows([one.name for one in report.models]), in_row_order(report.models)
     rows = [_error_row(one, horizons) for one in models if one.name in main]
     others = [_error_row(one, horizons) for one in models if one.name not in main]
     trials = trials_of_first(report)

@@ -114,7 +114,7 @@ def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
     if (stretches := unstated_grounds(summary)) and summary.inputs:
         times = [word for one in stretches[1:] for word in ("--terrain-change", f"{one.begin_s:.0f}")]
         command = shlex.join(["icrtool", "fit", summary.inputs[0].path, *times])
-    drive = advice(summary)
+    drive = what_to_drive(summary)
     distance = "without GNSS: not known yet, icrtool dropout-report tests it" if summary.usable else ""
     facts = Facts([("distance", distance), ("written to", place), ("next", drive)])
     return [Section("", [facts, next_line("" if drive else command)])]
@@ -139,7 +139,7 @@ def next_line(command: str) -> Line:
     return Line(f"{'next':12}{command}" if command else "", "as is")
 
 
-def advice(summary: RunDocument) -> str:
+def what_to_drive(summary: RunDocument) -> str:
     """Return what to drive next, of a run that is not usable for lack of turns; else empty."""
     return "" if summary.usable else to_drive(summary)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.align import agreement, choose_reference
+from icrtool.alignment.align import choose_reference, measure_agreement
 from icrtool.config import load_config
 from icrtool.pipeline import fit
 from icrtool.records.samples import StreamChoice
@@ -74,8 +74,8 @@ def test_preset_paper_keeps_what_was_chosen(good: RobotLog) -> None:
 
 
 def test_the_residual_is_that_of_the_positions(good: RobotLog) -> None:
-    assert agreement(good, CONFIG).residual_m < 0.1
-    assert agreement(with_noise(good, 1.0), CONFIG).residual_m == pytest.approx(np.sqrt(2) * 2.146, rel=0.25)
+    assert measure_agreement(good, CONFIG).residual_m < 0.1
+    assert measure_agreement(with_noise(good, 1.0), CONFIG).residual_m == pytest.approx(np.sqrt(2) * 2.146, rel=0.25)
 
 
 @pytest.mark.parametrize("delay_s", [5.0, 18.0])
@@ -84,8 +84,10 @@ def test_configured_delays_move_the_references_before_they_are_compared(good: Ro
     drifts = with_noise(good, 0.7, correlated_s=12.0)
     log = named(late, "/gps/fix", (named(drifts, "/lidar/pose"),))
     config = load_config(sets=["robot.track_width_m=0.8", f"frames.reference_delay_s={delay_s}"])
-    assert agreement(late, config).residual_m == pytest.approx(agreement(good, CONFIG).residual_m, rel=1e-6)
-    assert agreement(late, CONFIG).residual_m > 1.0
+    assert measure_agreement(late, config).residual_m == pytest.approx(
+        measure_agreement(good, CONFIG).residual_m, rel=1e-6
+    )
+    assert measure_agreement(late, CONFIG).residual_m > 1.0
     assert choose_reference(log, config) is log
 
 

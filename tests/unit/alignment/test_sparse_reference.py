@@ -12,7 +12,7 @@ import pytest
 
 import icrtool
 from icrtool.alignment.align import align
-from icrtool.alignment.sparse_reference import carried, spans_of_measured, without_interpolated
+from icrtool.alignment.sparse_reference import spans_of_measured, with_carried_heading, without_interpolated
 from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.track import Track
@@ -127,7 +127,7 @@ def spinning(every_s: float, rate_radps: float) -> tuple[Track, Floats]:
 
 def test_a_heading_is_carried_over_more_than_half_a_turn() -> None:
     track, true = spinning(5.0, 1.1)
-    found = carried(track)
+    found = with_carried_heading(track)
     inside = track.t <= track.heading_t[-1]
     np.testing.assert_allclose(found.heading_at(track.t)[inside], true[inside], atol=1e-6)
     assert found.measured_t is not None
@@ -136,10 +136,10 @@ def test_a_heading_is_carried_over_more_than_half_a_turn() -> None:
 
 def test_a_heading_that_is_not_rare_or_not_of_these_wheels_is_not_carried() -> None:
     track, _ = spinning(0.25, 1.1)
-    assert carried(track) is track
+    assert with_carried_heading(track) is track
     rare, _ = spinning(2.0, 0.5)
     other = rare._replace(heading=np.random.default_rng(0).uniform(-3.0, 3.0, len(rare.heading_t)))
-    assert carried(other) is other
+    assert with_carried_heading(other) is other
 
 
 def test_spans_begin_and_end_at_measured_headings() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.wheel_alignment import bridged
+from icrtool.alignment.wheel_alignment import bridge_gaps
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import DataError
@@ -18,7 +18,7 @@ from icrtool.records.measurements import Fixes
 from icrtool.records.notes import warnings_of
 from icrtool.records.samples import GyroSamples, HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
-from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense
+from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense_motion
 from icrtool.simulation.study_runs import readings_log
 from support.drives import ICRS, make_log
 
@@ -123,7 +123,7 @@ def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backward
     """With a side turned round, the origin's small circle would look like driving."""
     icrs, sensors = (0.5, -0.75, -0.25), Sensors(input_noise_mps=0.03)
     truth = drive_plan(DrivePlan(icrs_m=icrs, path=PathPlan("spins", 0.4), duration_s=90.0), 0.01)
-    log = readings_log(sense(truth, sensors, 90.0, np.random.default_rng(0)), sensors)
+    log = readings_log(sense_motion(truth, sensors, 90.0, np.random.default_rng(0)), sensors)
     run = fit(log, CONFIG)
     # The ICRs do lie to one side of the origin; nothing is said of wheels and heading.
     assert all("to the left of the position sensor" in warning for warning in run.warnings)
@@ -183,15 +183,15 @@ def test_gaps_of_wheels_that_report_positions_are_bridged() -> None:
 def test_few_wheel_samples_have_nothing_to_bridge(count: int) -> None:
     stamps = np.arange(count, dtype=np.int64) * 100_000_000
     wheels = WheelSamples(stamps, np.ones(count), np.ones(count), from_position=True)
-    assert bridged(wheels, 0.5, NO_FIXES) == (wheels, None)
+    assert bridge_gaps(wheels, 0.5, NO_FIXES) == (wheels, None)
 
 
 def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
     stamps = np.concatenate([np.arange(50), np.arange(200, 250)]).astype(np.int64) * 100_000_000
     wheels = WheelSamples(stamps, np.ones(100), np.ones(100), from_position=True)
-    assert bridged(wheels, 0.5, NO_FIXES)[0] is wheels
+    assert bridge_gaps(wheels, 0.5, NO_FIXES)[0] is wheels
     short = replace(wheels, stamp_ns=np.where(stamps > 10**10, stamps - 12 * 10**9, stamps))
-    filled, note = bridged(short, 0.5, NO_FIXES)
+    filled, note = bridge_gaps(short, 0.5, NO_FIXES)
     assert np.diff(filled.stamp_ns).tolist() == [100_000_000] * (len(filled.stamp_ns) - 1)
     assert note is not None
     assert note.text.startswith("1 gaps")

@@ -19,8 +19,8 @@ from icrtool.calibration.error_growth import (
     forecast_errors,
     forecast_plan,
     mean_error,
-    nonnegative,
-    radius,
+    radius_of_share,
+    solve_nonnegative,
     wheel_speeds,
 )
 from icrtool.calibration.pooled import calibrate_recordings, predictor
@@ -30,7 +30,7 @@ from icrtool.kernels.track import Windows
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import Recording, Trials, cut_trials, steps_of
 from icrtool.output.files.formats import read_numbers
-from icrtool.output.tables.calibration import forecast_csv, reach
+from icrtool.output.tables.calibration import distance_within, forecast_csv
 from icrtool.records.calibration_document import ErrorSources
 from support.recordings import FAMILY, SIX, WIDTH_M, draw_parameters, make_recording, trials_from_all
 
@@ -99,7 +99,7 @@ def test_quantiles_and_means_are_those_of_drawn_errors() -> None:
         size = np.linalg.norm(rng.multivariate_normal([0.0, 0.0], covariance, 200_000), axis=1)
         xx, xy, yy = (np.array([[covariance[i, j]]]) for i, j in ((0, 0), (0, 1), (1, 1)))
         spread = Spread(0 * xx, xx, xy, yy)
-        assert radius(spread, 0.95)[0] == pytest.approx(np.percentile(size, 95.0), rel=0.01)
+        assert radius_of_share(spread, 0.95)[0] == pytest.approx(np.percentile(size, 95.0), rel=0.01)
         assert mean_error(spread)[0] == pytest.approx(size.mean(), rel=0.01)
 
 
@@ -153,8 +153,8 @@ def test_a_drive_is_forecast_as_its_trials_from_the_start_are(calibration: Calib
 
 def test_a_budget_is_reached_between_metres(calibration: Calibration) -> None:
     found = forecast_plan(only(calibration, speed_share=0.01), np.zeros(2), np.array([0.0, 12.0]))
-    assert reach(found, 1.0) == pytest.approx(1.0 / 0.196, rel=0.01)
-    assert reach(found, 99.0) == 12.0
+    assert distance_within(found, 1.0) == pytest.approx(1.0 / 0.196, rel=0.01)
+    assert distance_within(found, 99.0) == 12.0
 
 
 def test_the_sources_come_back_from_a_file_and_without_them_nothing_is_forecast(calibration: Calibration) -> None:
@@ -266,6 +266,6 @@ def test_non_negative_least_squares_are_those_of_scipy(columns: int) -> None:
             design[:, -1] = 2.0 * design[:, -2]
         target = (design / np.maximum(design.max(axis=0), 1e-9)) @ np.maximum(rng.normal(size=columns), 0.0)
         target += rng.normal(0.0, 0.3, 60)
-        found = nonnegative(design.T @ design, design.T @ target)
+        found = solve_nonnegative(design.T @ design, design.T @ target)
         assert (found >= 0.0).all()
         assert np.linalg.norm(design @ found - target) == pytest.approx(nnls(design, target)[1], rel=1e-12)

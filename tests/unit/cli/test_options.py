@@ -1,4 +1,4 @@
-"""Options that reach a command as one argument (`icrtool.cli.options.together`)."""
+"""Options that reach a command as one argument (`icrtool.cli.options.options_as_record`)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from icrtool.cli.commands import icrtool as command_line
-from icrtool.cli.options import flag, option, together
+from icrtool.cli.options import flag, option, options_as_record
 
 COMMANDS = command_line.list_commands(click.Context(command_line))
 
@@ -34,7 +34,7 @@ def call(*arguments: str, change: bool = False) -> dict[str, object]:
     found: dict[str, object] = {}
 
     @click.command()
-    @together("pair", f"{__name__}:Pair" if change else Pair, LEFT, RIGHT, OTHER, change=change)
+    @options_as_record("pair", f"{__name__}:Pair" if change else Pair, LEFT, RIGHT, OTHER, change=change)
     def command(**given: object) -> None:
         found.update(given)
 

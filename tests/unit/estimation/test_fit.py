@@ -17,7 +17,7 @@ from icrtool.pipeline import fit
 from icrtool.records.run import WarmStart
 from icrtool.records.samples import PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
-from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense
+from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense_motion
 from icrtool.simulation.study_runs import readings_log
 from support.contract import RUN_KEYS
 from support.drives import ICRS, make_log
@@ -209,7 +209,7 @@ def spun(seconds: float, speed_mps: float = 0.3) -> RobotLog:
     icrs, plan = (0.5, -0.5, 0.0), PathPlan("spins", speed_mps)
     sensors = Sensors(input_noise_mps=0.01)
     truth = drive_plan(DrivePlan(icrs_m=icrs, path=plan, duration_s=seconds), 0.01)
-    return readings_log(sense(truth, sensors, seconds, np.random.default_rng(0)), sensors)
+    return readings_log(sense_motion(truth, sensors, seconds, np.random.default_rng(0)), sensors)
 
 
 def test_a_robot_that_spun_on_the_spot_has_learned_its_icrs_and_is_told_no_less() -> None:

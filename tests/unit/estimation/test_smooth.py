@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from icrtool.config import parse_config
-from icrtool.estimation.run_filter import smooth
+from icrtool.estimation.run_filter import smooth_run
 from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.tables import States
@@ -18,7 +18,7 @@ CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 @pytest.fixture(scope="module")
 def pair() -> tuple[Run, States]:
     run = fit(make_log(0, 60.0), CONFIG)
-    return run, smooth(run)
+    return run, smooth_run(run)
 
 
 def test_the_table_is_the_runs_row_by_row(pair: tuple[Run, States]) -> None:

@@ -15,7 +15,7 @@ from icrtool.output.tables.run import format_run
 from icrtool.pipeline import fit
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import Icrs, RobotLog
-from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense
+from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense_motion
 from icrtool.simulation.study_runs import readings_log
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
@@ -45,7 +45,7 @@ def drive(
     path = replace(path, phase_rad=rng.uniform(0, 6))
     plan = DrivePlan(icrs_m=ICRS, changes=tuple(slips) if slip else changes, path=path, duration_s=duration_s)
     sensors = Sensors(input_noise_mps=0.03)
-    return readings_log(sense(drive_plan(plan, 0.01), sensors, duration_s, rng), sensors)
+    return readings_log(sense_motion(drive_plan(plan, 0.01), sensors, duration_s, rng), sensors)
 
 
 @cache

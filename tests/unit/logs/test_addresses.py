@@ -264,9 +264,9 @@ def test_a_server_that_sends_a_byte_now_and_then_is_given_up(kind: str, monkeypa
     pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
     monkeypatch.setenv(SERVER_TIMEOUT_S, "1")
     began = time.monotonic()
-    read: Callable[[UrlPath], object] = find if kind == "a page that lists a folder" else open_log
+    read: Callable[[UrlPath], object] = find_logs_at if kind == "a page that lists a folder" else open_log
     with lying_server(SLOW[kind], b"1\r\n\0\r\n", pause_s=0.05) as (url, _), pytest.raises(LogError) as error:
-        read(UrlPath(url.replace("a.mcap", "folder/*.mcap") if read is find else url))
+        read(UrlPath(url.replace("a.mcap", "folder/*.mcap") if read is find_logs_at else url))
     assert "sent nothing for 1 s, or less than 10 kB/s" in str(error.value)
     assert time.monotonic() - began < 15.0
 
@@ -274,7 +274,7 @@ def test_a_server_that_sends_a_byte_now_and_then_is_given_up(kind: str, monkeypa
 def test_a_page_without_an_end_that_lists_a_folder_is_refused() -> None:
     pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
     with lying_server(SLOW["a page that lists a folder"], CHUNK) as (url, sent), pytest.raises(LogError) as error:
-        find(UrlPath(url.replace("a.mcap", "folder/*.mcap")))
+        find_logs_at(UrlPath(url.replace("a.mcap", "folder/*.mcap")))
     assert len(str(error.value).splitlines()) == 1
     assert sent[0] < 60_000_000
 

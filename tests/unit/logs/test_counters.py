@@ -11,7 +11,7 @@ import pytest
 import icrtool
 from icrtool.config import load_config
 from icrtool.logs.read_log import read_log
-from icrtool.logs.streams.counters import continued, find_modulus
+from icrtool.logs.streams.counters import find_modulus, unwrap_counter
 from support.field_logs import ROBOT, Drive, Message, fixes, imus, make_drive, numbers, write_messages
 
 DRIVE = make_drive(60.0)
@@ -32,7 +32,7 @@ def test_the_modulus_of_counters_is_in_the_numbers(modulus: int, signed: bool) -
     assert found is not None
     assert found.value == modulus
     for side, column in zip(sides, recorded, strict=True):
-        np.testing.assert_array_equal(np.diff(continued(column, found.value)), np.diff(side))
+        np.testing.assert_array_equal(np.diff(unwrap_counter(column, found.value)), np.diff(side))
 
 
 @pytest.mark.parametrize("modulus", [2377, 51_234])
@@ -49,7 +49,7 @@ def test_angles_that_begin_again_after_a_turn_are_known(turn: float, low: float)
     found = find_modulus([wrapped(angle, turn, low)])
     assert found is not None
     assert found.value == turn
-    np.testing.assert_allclose(np.diff(continued(wrapped(angle, turn, low), turn)), np.diff(angle), atol=1e-9)
+    np.testing.assert_allclose(np.diff(unwrap_counter(wrapped(angle, turn, low), turn)), np.diff(angle), atol=1e-9)
 
 
 NO_COUNTERS = {

@@ -25,7 +25,7 @@ from icrtool.logs.csv_table import LONGEST_HEAD_BYTES, MOST_COLUMNS
 from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.definitions import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
-from icrtool.logs.read_log import moment, read_log, survey_log
+from icrtool.logs.read_log import read_log, read_moment, survey_log
 from icrtool.logs.streams.sources import stamp_rows
 from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
 from icrtool.pipeline import fit
@@ -263,13 +263,14 @@ def test_a_cut_holds_the_messages_of_its_times(tmp_path: Path, kind: str) -> Non
 @pytest.mark.parametrize("text", ["nan", "inf", "noon", "2026-13-01", ""])
 def test_a_moment_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(LogError, match="--from"):
-        moment(text, "--from")
+        read_moment(text, "--from")
 
 
 def test_moments_are_seconds_or_times_with_a_zone() -> None:
-    assert moment("12.5", "--from") == 12.5
+    assert read_moment("12.5", "--from") == 12.5
     same = [
-        moment(text, "--from") for text in ("2026-05-04T09:30:00", "2026-05-04T09:30:00Z", "2026-05-04 11:30+02:00")
+        read_moment(text, "--from")
+        for text in ("2026-05-04T09:30:00", "2026-05-04T09:30:00Z", "2026-05-04 11:30+02:00")
     ]
     assert same[0] == same[1] == same[2]
 

@@ -11,7 +11,7 @@ import pytest
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.sources import HeadingSource, PositionSource, increasing, stamp_rows
+from icrtool.logs.streams.sources import HeadingSource, PositionSource, increasing_rows, stamp_rows
 from support.tables import START_NS, STEP_NS, read_source, table_of
 
 ROUNDING_DEG = 1e-12
@@ -530,7 +530,7 @@ def test_header_stamps_that_are_not_sane_are_left_and_the_reason_said(header: An
 
 
 def test_stamps_become_increasing_and_of_equals_the_last_stays() -> None:
-    rows, backwards, dropped = increasing(np.array([10, 30, 20, 20, 40]))
+    rows, backwards, dropped = increasing_rows(np.array([10, 30, 20, 20, 40]))
     assert rows.tolist() == [0, 3, 1, 4]
     assert (backwards, dropped) == (1, 1)
 

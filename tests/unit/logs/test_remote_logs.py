@@ -30,7 +30,7 @@ from icrtool.logs.containers import connection, source
 from icrtool.logs.containers.container import MessageBlock
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.recording_files import log_name
-from icrtool.logs.containers.source import find
+from icrtool.logs.containers.source import find_logs_at
 from icrtool.logs.read_log import read_log
 from icrtool.records.fleet_document import FleetFile
 from icrtool.records.places import UrlPath, place_of, without_secrets
@@ -345,8 +345,8 @@ def test_a_file_that_is_not_there_or_not_allowed_is_said_so(fresh):
 
 def test_patterns_folders_and_manifests_find_the_logs_of_a_bucket(fresh, tmp_path):
     everything = ["s3://field/mon/a.mcap", "s3://field/packed/d.mcap.gz", "s3://field/tue/b.bag", "s3://field/wed/c"]
-    assert [one.url for one in find(UrlPath("s3://field"))] == everything
-    assert [one.url for one in find(UrlPath("s3://field/**/*.bag"))] == everything[2:3]
+    assert [one.url for one in find_logs_at(UrlPath("s3://field"))] == everything
+    assert [one.url for one in find_logs_at(UrlPath("s3://field/**/*.bag"))] == everything[2:3]
     assert [one.name for one in find_recordings([UrlPath("s3://field/*/*.mcap"), UrlPath("s3://field/tue")])] == [
         "mon/a",
         "tue/b",
@@ -356,14 +356,16 @@ def test_patterns_folders_and_manifests_find_the_logs_of_a_bucket(fresh, tmp_pat
     (entry,) = read_manifest(manifest)
     assert [str(place) for place in entry.places] == everything[:1]
     with pytest.raises(LogError, match="matches nothing"):
-        find(UrlPath("s3://field/**/*.ulg"))
+        find_logs_at(UrlPath("s3://field/**/*.ulg"))
 
 
 def test_a_name_with_brackets_is_a_file_before_it_is_a_pattern(fresh):
     fresh.client.upload_file(str(MCAP), "field", "odd/drive[1].mcap")
     fresh.client.upload_file(str(MCAP), "field", "odd/drive2.mcap")
-    assert [one.url for one in find(UrlPath("s3://field/odd/drive[1].mcap"))] == ["s3://field/odd/drive[1].mcap"]
-    assert [one.url for one in find(UrlPath("s3://field/odd/drive[2].mcap"))] == ["s3://field/odd/drive2.mcap"]
+    assert [one.url for one in find_logs_at(UrlPath("s3://field/odd/drive[1].mcap"))] == [
+        "s3://field/odd/drive[1].mcap"
+    ]
+    assert [one.url for one in find_logs_at(UrlPath("s3://field/odd/drive[2].mcap"))] == ["s3://field/odd/drive2.mcap"]
     assert messages(UrlPath("s3://field/odd/drive[1].mcap")) == messages(MCAP)
     for name in ("odd/drive[1].mcap", "odd/drive2.mcap"):
         fresh.client.delete_object(Bucket="field", Key=name)

@@ -23,7 +23,7 @@ from icrtool.motion.window_fit import (
     heading_wander,
     own_constants,
     residuals_of,
-    shortening,
+    shortening_by_wander,
 )
 from support.recordings import FAMILY, WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all, twist
 
@@ -249,7 +249,7 @@ def test_a_heading_that_wanders_shortens_windows() -> None:
         heading = np.cumsum(rng.normal(0.0, np.sqrt(variance * step_m), int(length / step_m)))
         turned.append(heading[-1] + rng.normal(0.0, 0.05))
         moved.append(np.exp(1j * heading).mean())
-    found = shortening(heading_wander(np.array(turned), length_m), length_m)
+    found = shortening_by_wander(heading_wander(np.array(turned), length_m), length_m)
     for length in (5.0, 10.0):
         mine = length_m == length
         assert found[mine] == pytest.approx(np.mean(moved, where=mine).real, abs=0.004)

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from icrtool.cli.printing import show
+from icrtool.cli.printing import print_document
 from icrtool.errors import DataError, OutputError
 from icrtool.output.figures.study import study_figure, study_subtitle, study_title
 from icrtool.output.figures.style import new_figure
@@ -60,7 +60,7 @@ def test_every_number_of_the_table_is_whole_on_a_terminal_of_80_columns(
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("NO_COLOR", "1")
-    show(blocks, verbose=False)
+    print_document(blocks, verbose=False)
     shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
     assert shown.startswith(name)
     assert max(map(len, shown.splitlines())) <= 80

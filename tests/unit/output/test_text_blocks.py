@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from icrtool.cli.printing import show
+from icrtool.cli.printing import print_document
 from icrtool.output.tables.calibration import calibration_blocks
 from icrtool.output.tables.run import run_blocks
 from icrtool.output.text_blocks import (
@@ -23,7 +23,7 @@ from icrtool.output.text_blocks import (
     fitted_to,
     format_blocks,
     format_markdown,
-    stated,
+    stated_blocks,
 )
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, SensorDocument, SensorDrive
 from icrtool.records.run import Run
@@ -75,11 +75,11 @@ def test_what_is_empty_in_a_document_is_left_out() -> None:
         Section("Part", [Section("Inner", empty)], name="part"),
         Facts([("a", "1"), ("b", "")]),
     ]
-    assert list(stated(blocks)) == ["before", Facts([("a", "1")])]
+    assert list(stated_blocks(blocks)) == ["before", Facts([("a", "1")])]
     assert format_blocks(blocks).splitlines() == ["before", "a           1"]
     assert "Part" not in format_markdown(blocks)
     lead = Section("Answer", [], lead="yes", label="Trust?")
-    assert list(stated([lead])) == [lead]
+    assert list(stated_blocks([lead])) == [lead]
 
 
 def test_markdown_has_a_heading_a_section_an_item_a_sentence_and_escapes_names() -> None:
@@ -124,20 +124,20 @@ def test_a_terminal_gets_its_width_and_colours_and_no_markup_of_a_log(
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    show(PAGE, verbose=True)
+    print_document(PAGE, verbose=True)
     shown = capsys.readouterr().out
     assert "\x1b[1;31mNOT USABLE: x" in shown
     assert "a [bold]b" in shown
     monkeypatch.setenv("NO_COLOR", "1")
-    show(PAGE, verbose=True)
+    print_document(PAGE, verbose=True)
     plain = capsys.readouterr().out
     assert "\x1b[1;31m" not in plain
     assert max(map(len, plain.splitlines())) <= 60 + 8
     monkeypatch.setenv("TERM", "dumb")
-    show(PAGE, verbose=True)
+    print_document(PAGE, verbose=True)
     assert capsys.readouterr().out == f"{format_blocks(PAGE)}\n"
 
 
 def test_a_pipe_gets_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
-    show(PAGE, verbose=True)
+    print_document(PAGE, verbose=True)
     assert capsys.readouterr().out == f"{format_blocks(PAGE)}\n"

@@ -15,7 +15,7 @@ from icrtool.output.tables.run import to_drive, warnings_line
 from icrtool.pipeline import fit
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.note_catalogue import CATALOGUE
-from icrtool.records.notes import Note, about, first_to_read, note, unusable_because, warnings_of
+from icrtool.records.notes import Note, first_to_read, note, notes_about, unusable_because, warnings_of
 from icrtool.records.run import Run
 from icrtool.records.text import LogText
 from support.barn import configured, simulate
@@ -44,13 +44,13 @@ def test_a_code_without_explanation_is_refused() -> None:
 
 def test_a_finding_about_a_log_of_any_name_is_encoded() -> None:
     name = LogText("drive\n\u202e.bag")
-    for one in (note("log_cut_off", "cut off", name), *about(name, [MOVED])):
+    for one in (note("log_cut_off", "cut off", name), *notes_about(name, [MOVED])):
         assert msgspec.json.decode(msgspec.json.encode(one), type=Note) == one
         assert one.subject == "drive\\n\\u202e.bag"
 
 
 def test_warnings_are_the_sentences_and_grave_findings_the_reasons() -> None:
-    found = (*about("drive", [MOVED]), CUT, *REASONS)
+    found = (*notes_about("drive", [MOVED]), CUT, *REASONS)
     assert warnings_of(found) == (
         "drive: the position lags the wheels by 0.20 s: corrected", "drive.bag: a text that says nothing",
     )  # fmt: skip
@@ -103,5 +103,5 @@ def test_other_words_change_nothing_that_a_program_decides(run: Run) -> None:
 
 def test_a_finding_about_a_name_of_a_log_can_be_encoded() -> None:
     named = LogText("drive")
-    for one in (note(MOVED.code, "moved", named), *about(named, [MOVED])):
+    for one in (note(MOVED.code, "moved", named), *notes_about(named, [MOVED])):
         assert msgspec.json.decode(msgspec.json.encode(one), type=Note).subject == "drive"

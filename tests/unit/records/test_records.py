@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.align import sensors_as_sent
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.run import Run
-from icrtool.records.samples import thin
+from icrtool.records.samples import without_repeats
 from support.barn import configured, simulate
 from support.documents import with_summary
 
@@ -61,11 +61,11 @@ def test_alignment_tells_what_it_applied(run: Run) -> None:
 
 def test_plain_data_is_what_json_gives_back() -> None:
     data = {"a": (1, np.float64(2.5)), "b": float("nan"), "c": np.arange(2), 3: None, "d": [np.int64(4), True]}
-    assert plain(data) == {"a": [1, 2.5], "b": None, "c": [0, 1], "3": None, "d": [4, True]}
+    assert plain_value(data) == {"a": [1, 2.5], "b": None, "c": [0, 1], "3": None, "d": [4, True]}
 
 
 def test_a_thin_column_keeps_the_column_it_was_made_of_no_longer() -> None:
     column = np.full(1000, 2.0)
-    found = thin(column)
+    found = without_repeats(column)
     assert np.array_equal(found, column)
     assert not np.shares_memory(found, column)

@@ -25,7 +25,7 @@ from icrtool.simulation.drives import (
     plan_body,
     record_drive,
     sample_times,
-    sense,
+    sense_motion,
     simulate,
     track_speeds,
 )
@@ -113,7 +113,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_does_not() -> None:
 def test_sensors_without_error_tell_the_truth() -> None:
     plan = DrivePlan(duration_s=20.0)
     truth = drive_plan(plan, 0.01)
-    seen = sense(truth, QUIET, 20.0, rng())
+    seen = sense_motion(truth, QUIET, 20.0, rng())
     np.testing.assert_array_equal(seen.gnss_m, truth.poses(seen.gnss_t)[:, :2])
     np.testing.assert_array_equal(seen.heading_rad, truth.poses(seen.heading_t)[:, 2])
     np.testing.assert_allclose(
@@ -127,7 +127,7 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
     plan = DrivePlan(duration_s=100.0)
     truth = drive_plan(plan, 0.01)
     sensors = replace(QUIET, gnss_std_m=0.3, heading_std_rad=0.05, input_noise_mps=0.1, input_bias_mps=0.02)
-    seen, clean = sense(truth, sensors, 100.0, rng()), sense(truth, QUIET, 100.0, rng())
+    seen, clean = sense_motion(truth, sensors, 100.0, rng()), sense_motion(truth, QUIET, 100.0, rng())
     assert (seen.gnss_m - clean.gnss_m).std() == pytest.approx(0.3, rel=NOISE_SHARE)
     assert (seen.heading_rad - clean.heading_rad).std() == pytest.approx(0.05, rel=NOISE_SHARE)
     off = seen.v_left_mps - clean.v_left_mps
@@ -139,7 +139,7 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
 def test_encoders_count_whole_counts_and_lose_none() -> None:
     sensors = Sensors(metres_per_count=0.001, heading_resolution_rad=math.radians(0.05))
     truth = drive_plan(DrivePlan(duration_s=20.0), 0.01)
-    seen = sense(truth, sensors, 20.0, rng())
+    seen = sense_motion(truth, sensors, 20.0, rng())
     counts = seen.travel_left_m / 0.001
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
     assert 0 <= truth.travel_left_m[np.searchsorted(truth.t_s, seen.wheel_t[-1])] - seen.travel_left_m[-1] < 0.001
@@ -153,15 +153,15 @@ def test_commands_are_held_and_the_tracks_lag_behind_them() -> None:
     for step in range(5):
         held = (truth.t_s >= step / 10) & (truth.t_s < (step + 1) / 10 - 1e-9)
         assert len(np.unique(truth.command_left_mps[held])) == 1
-    seen = sense(truth, replace(QUIET, wheels="commanded", wheel_rate_hz=10.0), 20.0, rng())
+    seen = sense_motion(truth, replace(QUIET, wheels="commanded", wheel_rate_hz=10.0), 20.0, rng())
     np.testing.assert_array_equal(seen.v_left_mps, truth.command_left_mps[truth.rows(seen.wheel_t)])
     assert np.abs(truth.v_left_mps - truth.command_left_mps).max() > 1e-3
 
 
 def test_an_outage_takes_its_fixes_away_and_touches_no_other() -> None:
     truth = drive_plan(DrivePlan(duration_s=20.0), 0.01)
-    whole = sense(truth, Sensors(), 20.0, rng())
-    holed = sense(truth, Sensors(outages_s=((5.0, 8.0),)), 20.0, rng())
+    whole = sense_motion(truth, Sensors(), 20.0, rng())
+    holed = sense_motion(truth, Sensors(outages_s=((5.0, 8.0),)), 20.0, rng())
     kept = (whole.gnss_t < 5.0) | (whole.gnss_t >= 8.0)
     np.testing.assert_array_equal(holed.gnss_m, whole.gnss_m[kept])
     np.testing.assert_array_equal(holed.heading_rad, whole.heading_rad)
@@ -169,7 +169,7 @@ def test_an_outage_takes_its_fixes_away_and_touches_no_other() -> None:
 
 def test_the_antenna_stands_where_it_was_put() -> None:
     truth = drive_plan(DrivePlan(duration_s=5.0, start_heading_rad=math.pi / 2), 0.01)
-    seen = sense(truth, replace(QUIET, antenna_forward_m=0.3, antenna_right_m=0.1), 5.0, rng())
+    seen = sense_motion(truth, replace(QUIET, antenna_forward_m=0.3, antenna_right_m=0.1), 5.0, rng())
     np.testing.assert_allclose(seen.gnss_m[0], [-0.1, 0.3], atol=ROUNDING)
 
 
@@ -186,7 +186,7 @@ def test_fixes_stand_on_the_globe_about_the_datum() -> None:
     from pymap3d import geodetic2ned
 
     truth = drive_plan(DrivePlan(duration_s=50.0), 0.01)
-    seen = sense(truth, QUIET, 50.0, rng())
+    seen = sense_motion(truth, QUIET, 50.0, rng())
     told = record_drive(seen, QUIET, rng())
     north, east, _ = geodetic2ned(told.latitude_deg, told.longitude_deg, told.height_m, *DATUM)
     np.testing.assert_allclose(np.column_stack([north, east]), seen.gnss_m, atol=1e-6)

@@ -20,7 +20,7 @@ import pytest
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.figures.filter_estimates import gnss_difference
-from icrtool.output.page.drive_data import drive_data, packed, packed_levels, packed_sums
+from icrtool.output.page.drive_data import drive_data, pack_column, packed_levels, packed_sums
 from icrtool.output.page.pages import draw_pictures, run_page, write_page
 from icrtool.output.page.render import pictures_of
 from icrtool.output.page.sketch import drive_sketch
@@ -28,7 +28,7 @@ from icrtool.output.tables.dropout import reach_rows, report_blocks
 from icrtool.output.text_blocks import format_blocks
 from icrtool.pipeline import fit
 from icrtool.records.measurements import ReferenceJump
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import plain_value
 from icrtool.records.run import Run, track_of
 from icrtool.records.run_document import EventDocument
 from icrtool.records.tables import RobotLog
@@ -215,7 +215,7 @@ def test_a_report_on_the_smoothed_trajectory_is_drawn_along_it() -> None:
 def test_running_sums_do_not_gather_errors() -> None:
     rng = np.random.default_rng(16)
     column = np.cumsum(rng.normal(0.02, 0.01, 200_000))
-    packed_column = plain(packed_sums(column))
+    packed_column = plain_value(packed_sums(column))
     found, unit = numbers(packed_column), packed_column["unit"]
     assert np.abs(found - column).max() <= 0.5001 * unit
     assert unit < 3e-6
@@ -223,10 +223,12 @@ def test_running_sums_do_not_gather_errors() -> None:
 
 def test_columns_survive_their_packing() -> None:
     column = np.random.default_rng(16).normal(size=100)
-    np.testing.assert_allclose(numbers(plain(packed(column))), column, rtol=1e-7)
+    np.testing.assert_allclose(numbers(plain_value(pack_column(column))), column, rtol=1e-7)
     # Half of a 32,000th of the greatest.
-    np.testing.assert_allclose(numbers(plain(packed_levels(column))), column, atol=0.51 / 32_000 * np.abs(column).max())
-    np.testing.assert_array_equal(numbers(plain(packed_sums(np.array([3, 4, 9]), unit=1))), [3, 4, 9])
+    np.testing.assert_allclose(
+        numbers(plain_value(packed_levels(column))), column, atol=0.51 / 32_000 * np.abs(column).max()
+    )
+    np.testing.assert_array_equal(numbers(plain_value(packed_sums(np.array([3, 4, 9]), unit=1))), [3, 4, 9])
 
 
 def test_the_page_may_load_nothing_and_run_only_its_own_scripts(page: str) -> None:
@@ -325,7 +327,7 @@ def test_a_run_of_one_state_or_two_is_drawn(samples: int, report: DropoutReport)
     fixes = pd.DataFrame({"t_s": [0.0, 1.0], "north_m": [0.0, 2.7], "east_m": [0.0, 0.01]})
     headings = pd.DataFrame({"t_s": [0.01, 1.01], "heading_rad": [0.0, 0.05]})
     run = fit(RobotLog.from_frames(wheels, fixes, headings), configured())
-    data = plain(drive_data(run, report.document, coordinates=True))
+    data = plain_value(drive_data(run, report.document, coordinates=True))
     assert len(numbers(data["steps"]["left"])) == samples - 1
     assert [len(numbers(path["north"])) for path in data["paths"].values()] == [samples - 1] * len(data["paths"])
     assert "icr_final" in data["paths"]
