@@ -88,30 +88,16 @@ def summarise(
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation, x_clock_std_m = assess_icrs(filtered, config, sensors.facts.clock_std_s)
     multiplier = None if width is None else (separation_multiplier(table, width), multiplier_std(covariance, width))
-    inverted = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1])
-    rules = config.filter.rules
-    scale = measurements.findings["wheel_scale"] if rules.corrects else None
-    of_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
-    # of measurements while the wheels turn
-    of_fixes, of_headings = sensors.moving()
-    rejected = {
-        "fixes": rejected_share(filtered.gnss.code[of_fixes]),
-        "headings": rejected_share(filtered.heading.code[of_headings]),
-    }
-    one_ground = not changes_s and measurements.wheels.ground_change_s is None
-    unusable = unusable_reasons(
-        excitation, rejected, filtered.noise, scale, multiplier if of_twist else None,
-        contradicts_windows(table, covariance, measurements.findings) if rules.corrects and one_ground else "",
-        measurements.wheels.filtered or "" if rules.corrects else "",
-        measurements.wheels,
-        inverted=inverted,
-    )  # fmt: skip
+    inverted, rejected = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]), _rejected_shares(filtered)
+    unusable = _unusable_reasons(
+        measurements, filtered, config, multiplier, excitation, changes_s, covariance, rejected, inverted=inverted
+    )
     notes = _notes(
         measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance,
         rejected, inverted=inverted,
     )  # fmt: skip
     notes = (*notes, *notes_about(sensors.name, unusable))
-    hidden = () if rules.final_of_filter else excitation.verdict.not_shown
+    hidden = () if config.filter.rules.final_of_filter else excitation.verdict.not_shown
     lag = measurements.findings["heading_delay_s"]
     start_ns = int(table.stamp_ns[0])
     return RunDocument(
@@ -148,6 +134,34 @@ def summarise(
         facts=sensors.facts,
         filter=filter_summary(measurements, filtered, config),
         excitation=excitation,
+    )  # fmt: skip
+
+
+def _rejected_shares(filtered: Filtered) -> dict[str, float]:
+    """Return the shares of fixes and of headings that were rejected while the wheels turned."""
+    of_fixes, of_headings = filtered.sensors.moving()
+    return {
+        "fixes": rejected_share(filtered.gnss.code[of_fixes]),
+        "headings": rejected_share(filtered.heading.code[of_headings]),
+    }
+
+
+def _unusable_reasons(
+    measurements: Measurements, filtered: Filtered, config: Config, multiplier: tuple[float, float] | None,
+    excitation: ExcitationDocument, changes_s: Sequence[float], covariance: Floats, rejected: dict[str, float], *,
+    inverted: bool,
+) -> list[Note]:  # fmt: skip
+    """Return why the ICRs must not be used; none where they can be. Parameters are those of `_notes`."""
+    corrects, wheels = config.filter.rules.corrects, measurements.wheels
+    of_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
+    one_ground = not changes_s and wheels.ground_change_s is None
+    contradiction = ""
+    if corrects and one_ground:
+        contradiction = contradicts_windows(filtered.table, covariance, measurements.findings)
+    return unusable_reasons(
+        excitation, rejected, filtered.noise, measurements.findings["wheel_scale"] if corrects else None,
+        multiplier if of_twist else None, contradiction, wheels.filtered or "" if corrects else "", wheels,
+        inverted=inverted,
     )  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import socket
 import threading
@@ -16,6 +15,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 from urllib.request import Request, urlopen
+
+import pytest
 
 SECRET = "d0ntPr1ntTh1s"
 """Of the credentials: stands in no output."""
@@ -192,8 +193,9 @@ def object_store() -> Iterator[Proxy]:
             "AWS_ENDPOINT_URL": f"http://127.0.0.1:{proxy.port}", "AWS_ACCESS_KEY_ID": "testing",
             "AWS_SECRET_ACCESS_KEY": SECRET, "AWS_DEFAULT_REGION": "us-east-1",
         }  # fmt: skip
-        before = {name: os.environ.get(name) for name in settings}
-        os.environ.update(settings)
+        patch = pytest.MonkeyPatch()
+        for name, value in settings.items():
+            patch.setenv(name, value)
         try:
             proxy.client = boto3.client("s3", endpoint_url=f"http://127.0.0.1:{port}")
             proxy.client.create_bucket(Bucket="field")
@@ -202,9 +204,5 @@ def object_store() -> Iterator[Proxy]:
         finally:
             # What moto holds outlives its server.
             urlopen(Request(f"http://127.0.0.1:{port}/moto-api/reset", method="POST")).close()
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
+            patch.undo()
     server.stop()

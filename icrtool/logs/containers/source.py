@@ -154,16 +154,16 @@ class RemoteFile:
         async def one(begin: int, end: int) -> bytes:
             session = await self._files.set_session()
             headers = {"Range": f"bytes={begin}-{end - 1}", "Accept-Encoding": "identity"}
-            began_s = time.monotonic()
+            began_s, quiet_s = time.monotonic(), server_timeout_s()
             async with (
-                asyncio.timeout(server_timeout_s() + (end - begin) / SLOWEST_BPS),
+                asyncio.timeout(quiet_s + (end - begin) / SLOWEST_BPS),
                 session.get(self._files.encode_url(self._name), headers=headers) as answer,
             ):
                 if answer.status >= 400:
                     answer.raise_for_status()
                 _check_range(answer, begin, end, self.size)
-                pieces, left = [], end - begin
-                while left and (piece := await answer.content.read(left)):
+                pieces, missing = [], end - begin
+                while missing and (piece := await answer.content.read(missing)):
                     pieces.append(piece)
                     left -= len(piece)
                     check_pace(began_s, end - begin - left)
@@ -265,7 +265,7 @@ class RemoteFile:
         """Yield the content from start to end; the next pieces are read meanwhile."""
         if not self.has_ranges:
             options = {"headers": {"Accept-Encoding": "identity"}} if self.path.scheme.startswith("http") else {}
-            began_s, received = time.monotonic(), 0
+            began_s, quiet_s, received = time.monotonic(), server_timeout_s(), 0
             with ask_server(self.path, lambda: self._files.open(self._name, block_size=0, **options)) as stream:
                 while piece := ask_server(self.path, lambda: stream.read(_FETCHED_BYTES), again=False):
                     received += len(piece)
