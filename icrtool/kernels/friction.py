@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.compiled import njit
+from icrtool.kernels.compiled import njit, njit_part
 
 GRAVITY_MPS2 = 9.81
 
@@ -55,8 +55,47 @@ class SlidingBody(NamedTuple):
     cell: float
 
 
+@njit_part
+def contact_forces(
+    v_x: float, v_y: float, omega: float, left: float, right: float, per_x: float, per_y: float, contact_x: Floats,
+    contact_y: Floats, grip: Floats, body: SlidingBody,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the force ahead and to the right [N], and its moment about the centre of mass [N m], of all contacts.
+
+    Parameters
+    ----------
+    v_x, v_y, omega : velocity of the body origin [m/s] and turn rate [rad/s]
+    left, right : track speeds [m/s]
+    per_x, per_y : growth of a contact's load with its place ahead and to the right [N/m]
+    contact_x, contact_y : (c,) contacts, body frame [m]
+    grip : (2,) friction coefficient of left and right side
+    body : constants
+
+    Notes
+    -----
+    A contact with load p that slides with velocity s is held back by mu p s / sqrt(|s|^2 + s0^2) (regularised Coulomb
+    friction).
+    """
+    force_x, force_y, moment = 0.0, 0.0, 0.0
+    for i in range(len(contact_x)):
+        x, y = contact_x[i], contact_y[i]
+        load = max(body.mass * GRAVITY_MPS2 / len(contact_x) + per_x * x + per_y * y, 0.0)
+        track = right if y > 0.0 else left
+        along = v_x - omega * y
+        slip_x, slip_y = along - track, v_y + omega * x
+        smooth = body.slip + body.creep * abs(track)
+        limit = grip[1 if y > 0.0 else 0] * load
+        held = limit / math.sqrt(slip_x * slip_x + slip_y * slip_y + smooth * smooth)
+        drag = body.resistance * load * along / math.sqrt(along * along + ROLLING_MPS * ROLLING_MPS)
+        f_x, f_y = -held * slip_x - drag, -held * body.lateral * slip_y
+        force_x += f_x
+        force_y += f_y
+        moment += (x - body.mass_forward) * f_y - (y - body.mass_right) * f_x
+    return force_x, force_y, moment
+
+
 @njit
-def slide(  # noqa: PLR0915 - the equations of one step, in the order in which they act
+def slide(
     t: Floats, forward: Floats, turn: Floats, heading: Floats, decides: Ints, contact_x: Floats, contact_y: Floats,
     grip: Floats, slope: Floats, body: SlidingBody, commands: Floats, tracks: Floats, pose: Floats, velocity: Floats,
 ) -> None:  # fmt: skip
@@ -77,13 +116,11 @@ def slide(  # noqa: PLR0915 - the equations of one step, in the order in which t
 
     Notes
     -----
-    Newton and Euler in the body frame, semi-implicit Euler steps of at most `LONGEST_SUBSTEP_S`. A contact with load p
-    that slides with velocity s is held back by mu p s / sqrt(|s|^2 + s0^2) (regularised Coulomb friction); the load
-    shifts with the acceleration and the height of the centre of mass.
+    Newton and Euler in the body frame with the forces of `contact_forces`, semi-implicit Euler steps of at most
+    `LONGEST_SUBSTEP_S`. The load shifts with the acceleration and the height of the centre of mass.
     """
-    c, cells = len(contact_x), len(grip)
-    sum_xx, sum_yy = 0.0, 0.0
-    for i in range(c):
+    cells, sum_xx, sum_yy = len(grip), 0.0, 0.0
+    for i in range(len(contact_x)):
         sum_xx += contact_x[i] * contact_x[i]
         sum_yy += contact_y[i] * contact_y[i]
     north, east, psi = pose[0, 0], pose[0, 1], pose[0, 2]
@@ -119,21 +156,9 @@ def slide(  # noqa: PLR0915 - the equations of one step, in the order in which t
             per_x = (GRAVITY_MPS2 * body.mass_forward - a_x * body.mass_height) * body.mass / sum_xx
             per_y = (GRAVITY_MPS2 * body.mass_right - a_y * body.mass_height) * body.mass / sum_yy
             v_x = u + omega * body.mass_right
-            force_x, force_y, moment = 0.0, 0.0, 0.0
-            for i in range(c):
-                x, y = contact_x[i], contact_y[i]
-                load = max(body.mass * GRAVITY_MPS2 / c + per_x * x + per_y * y, 0.0)
-                track = right if y > 0.0 else left
-                along = v_x - omega * y
-                slip_x, slip_y = along - track, v_y + omega * x
-                smooth = body.slip + body.creep * abs(track)
-                limit = grip[cell, 1 if y > 0.0 else 0] * load
-                held = limit / math.sqrt(slip_x * slip_x + slip_y * slip_y + smooth * smooth)
-                drag = body.resistance * load * along / math.sqrt(along * along + ROLLING_MPS * ROLLING_MPS)
-                f_x, f_y = -held * slip_x - drag, -held * body.lateral * slip_y
-                force_x += f_x
-                force_y += f_y
-                moment += (x - body.mass_forward) * f_y - (y - body.mass_right) * f_x
+            force_x, force_y, moment = contact_forces(
+                v_x, v_y, omega, left, right, per_x, per_y, contact_x, contact_y, grip[cell], body
+            )
             of_x = force_x / body.mass + GRAVITY_MPS2 * slope[k, 0]
             of_y = force_y / body.mass + GRAVITY_MPS2 * slope[k, 1]
             a_x, a_y = a_x + (of_x - a_x) * followed, a_y + (of_y - a_y) * followed
