@@ -86,7 +86,7 @@ def survey_log(
             ended.set()
             raise
         channels, transfer = tuple(container.channels), container.transfer()
-    check_unchanged(path, before, inputs.result())
+    check_unchanged(path, states_before, inputs.result())
     names = LogText(log_name(path)), escaped(str(path))
     return Survey(*names, channels, tuple(tables), candidates, problems, inputs.result(), transfer)
 
@@ -179,8 +179,8 @@ def collect_tables(
                     if number not in collectors:
                         # A definition is compiled when its first message comes: a log may declare any number of topics.
                         collectors[number] = None
-                        before = by_topic.get(topics[number])
-                        by_topic[topics[number]] = collector_for(by_id[number], wanted[number], before, budget)
+                        earlier_table = by_topic.get(topics[number])
+                        by_topic[topics[number]] = collector_for(by_id[number], wanted[number], earlier_table, budget)
                         collectors[number] = by_topic[topics[number]]
                     if (collector := collectors[number]) is not None:
                         collector.feed(block, number)
@@ -203,7 +203,7 @@ def _report_definitions(container: Container, channels: Sequence[Channel]) -> No
             container.report("definition_bundled", f"{channel.topic}: {note}; the bundled definition is used")
 
 
-def read_moment(given: Moment | None, key: str) -> float | datetime | None:
+def read_moment(moment: Moment | None, key: str) -> float | datetime | None:
     """Return a moment as seconds since the log's first message, or as a time with a zone.
 
     Raises
@@ -211,20 +211,20 @@ def read_moment(given: Moment | None, key: str) -> float | datetime | None:
     LogError
         Neither a finite number nor a time in ISO 8601.
     """
-    if isinstance(given, str):
-        text = given
+    if isinstance(moment, str):
+        text = moment
         with contextlib.suppress(ValueError):
-            given = float(text)
+            moment = float(text)
         try:
-            given = datetime.fromisoformat(text) if isinstance(given, str) else given
+            moment = datetime.fromisoformat(text) if isinstance(moment, str) else moment
         except ValueError as err:
             why = f"{text!r} is neither a number of seconds nor a time in ISO 8601"
             raise LogError(key, why, "for example 12.5, or 2026-05-04T09:30:00") from err
-    if given is None or isinstance(given, datetime):
-        return given if given is None or given.tzinfo is not None else given.replace(tzinfo=UTC)
-    if not math.isfinite(given):
-        raise LogError(key, f"{given} is not a number of seconds")
-    return float(given)
+    if moment is None or isinstance(moment, datetime):
+        return moment if moment is None or moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    if not math.isfinite(moment):
+        raise LogError(key, f"{moment} is not a number of seconds")
+    return float(moment)
 
 
 def cut_of(container: Container, start: float | datetime | None, end: float | datetime | None, log: Path) -> Cut:
@@ -284,11 +284,11 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
     import pandas as pd
 
     begin, stop = read_moment(start, "start"), read_moment(end, "end")
-    before = states_of(path)
+    states_before = states_of(path)
     try:
         with plain_file(path) as (file, read):
             table = csv_frame(file)
-        check_unchanged(path, before, [read])
+        check_unchanged(path, states_before, [read])
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
     except ValueError as err:

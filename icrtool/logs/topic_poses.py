@@ -88,15 +88,15 @@ def read_topic_poses(path: str | Path, topics: Sequence[str], progress: Progress
         wanted = {one.id: _fields_of(one) for one in chosen}
         tables, unread = collect_tables(container, wanted, progress=progress)
     by_topic = {str(table.topic): table for table in tables}
-    found = []
+    poses = []
     for topic in topics:
         if topic in unread:
             raise ConfigError("score", f"{topic}: {unread[topic]}", "name another topic")
         try:
-            found.append(_poses_of(by_topic[topic], path))
+            poses.append(_poses_of(by_topic[topic], path))
         except DefinitionError as err:
             raise ConfigError("score", f"{topic}: {err.why}", "name another topic") from err
-    return found
+    return poses
 
 
 def _channels_of(topics: Sequence[str], channels: Sequence[Channel]) -> list[Channel]:
@@ -142,14 +142,14 @@ def _poses_of(table: TopicTable, log: Path) -> TopicPoses:
         usable: Bools = (norm > LEAST_QUATERNION) & (norm < LARGEST_QUATERNION) & np.isfinite(x) & np.isfinite(y)
     stamps = stamp_rows(table)
     order = stamps.header_ns if stamps.header_ns is not None else stamps.log_ns
-    kept, _, _ = increasing_rows(order, usable)
-    if len(order[kept]) < 2:
-        raise DataError(log, f"{table.topic} holds {len(order[kept])} usable poses", "at least two are needed")
-    ahead, left, _ = turned_axis(0, *(one[kept] / norm[kept] for one in q))
+    rows, _, _ = increasing_rows(order, usable)
+    if len(order[rows]) < 2:
+        raise DataError(log, f"{table.topic} holds {len(order[rows])} usable poses", "at least two are needed")
+    ahead, left, _ = turned_axis(0, *(one[rows] / norm[rows] for one in q))
     # Seen from above, y is left of x; in a frame whose z points down it is right of x.
     side = 1.0 if frame_convention(table)[0] == "ned" else -1.0
     heading = unwrapped(np.arctan2(side * left, ahead))
-    header_ns = None if stamps.header_ns is None else stamps.header_ns[kept]
-    log_ns = np.maximum.accumulate(stamps.log_ns[kept])
-    gap = long_intervals(np.diff(order[kept]) / 1e9)
-    return TopicPoses(str(table.topic), kind, header_ns, log_ns, x[kept] + side * 1j * y[kept], heading, gap)
+    header_ns = None if stamps.header_ns is None else stamps.header_ns[rows]
+    log_ns = np.maximum.accumulate(stamps.log_ns[rows])
+    gap = long_intervals(np.diff(order[rows]) / 1e9)
+    return TopicPoses(str(table.topic), kind, header_ns, log_ns, x[rows] + side * 1j * y[rows], heading, gap)

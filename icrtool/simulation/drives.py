@@ -318,9 +318,9 @@ def sense_motion(truth: Truth, sensors: Sensors, duration_s: float, rng: np.rand
     gnss_t = sample_times(sensors.gnss_rate_hz, duration_s)
     # Noise is drawn for the whole drive, so that an outage changes no fix outside it.
     noise = rng.normal(0.0, 1.0, (len(gnss_t), 2)) * sensors.gnss_std_m
-    seen = np.ones(len(gnss_t), np.bool_)
+    has_fix = np.ones(len(gnss_t), np.bool_)
     for begin, end in sensors.outages_s:
-        seen &= (gnss_t < begin) | (gnss_t >= end)
+        has_fix &= (gnss_t < begin) | (gnss_t >= end)
     heading_t = sample_times(sensors.heading_rate_hz, duration_s)
     psi = truth.poses(heading_t)[:, 2] + sensors.heading_offset_rad
     psi += rng.normal(0.0, 1.0, len(heading_t)) * sensors.heading_std_rad
@@ -332,9 +332,9 @@ def sense_motion(truth: Truth, sensors: Sensors, duration_s: float, rng: np.rand
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     forward, right = sensors.antenna_forward_m, sensors.antenna_right_m
     antenna = pose[:, :2] + np.column_stack([forward * c - right * s, forward * s + right * c])
-    fixes = (antenna + noise)[seen]
+    fixes = (antenna + noise)[has_fix]
     left_m, right_m = (travel[:-1] for travel in travels)
-    return Readings(wheel_t, left_m, right_m, v_left, v_right, gnss_t[seen], fixes, heading_t, psi, turn)
+    return Readings(wheel_t, left_m, right_m, v_left, v_right, gnss_t[has_fix], fixes, heading_t, psi, turn)
 
 
 def sample_times(rate_hz: float, duration_s: float) -> Floats:

@@ -165,8 +165,8 @@ the same three percentiles (``first``). Between levels: range of the means, leas
 
 
 def _percentiles(values: Floats) -> tuple[float, ...]:
-    found = statistics(values)
-    return found["p5"], found["p50"], found["p95"]
+    numbers = statistics(values)
+    return numbers["p5"], numbers["p50"], numbers["p95"]
 
 
 def _middle(values: Floats) -> float:
@@ -304,11 +304,11 @@ def reported_numbers(numbers: Sequence[Number], levels: Sequence[Level]) -> list
                     names = fnmatch.filter(level.numbers(), number.columns.format(icr=icr))
                     columns = np.concatenate([level.found[name] for name in names])
                     pooled.setdefault(what, (number, level, {}))[2][place] = columns
-    found = []
+    numbers_found = []
     for what, (number, level, by_level) in pooled.items():
         paper = number.paper
         if not isinstance(paper, str):
             keys = (level.setting.value, level.setting.series, "")
             paper = next((paper[key] for key in keys if key in paper), "")
-        found.append(StudyNumber(what, HOW[number.how](list(by_level.values())), number.unit, paper))
-    return found
+        numbers_found.append(StudyNumber(what, HOW[number.how](list(by_level.values())), number.unit, paper))
+    return numbers_found

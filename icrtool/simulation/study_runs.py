@@ -251,13 +251,13 @@ def measure_means(run: StudyRun) -> Found:
     Also the mean distance of the filter's position from the true one.
     """
     half = len(run.t_s) // 2
-    found: Found = {"inverted": is_inverted(run)}
+    means: Found = {"inverted": is_inverted(run)}
     for place, name in enumerate(ICR_NAMES, start=3):
-        found[f"mean_{name}_m"] = run.x[half:, place].mean()
-        found[f"scatter_{name}_m"] = run.x[half:, place].std()
-        found[f"true_{name}_m"] = run.truth[half:, place].mean()
-    found["position_error_m"] = float(np.hypot(*(run.x[half:, :2] - run.truth[half:, :2]).T).mean())
-    return found
+        means[f"mean_{name}_m"] = run.x[half:, place].mean()
+        means[f"scatter_{name}_m"] = run.x[half:, place].std()
+        means[f"true_{name}_m"] = run.truth[half:, place].mean()
+    means["position_error_m"] = float(np.hypot(*(run.x[half:, :2] - run.truth[half:, :2]).T).mean())
+    return means
 
 
 def _mean_nis(run: StudyRun) -> Found:

@@ -190,12 +190,12 @@ class Inflation:
         """
         if unpacked > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {unpacked} bytes")
-        left = self.left + LARGEST_RATIO * packed - unpacked
-        if left < 0:
+        allowed_bytes = self.left + LARGEST_RATIO * packed - unpacked
+        if allowed_bytes < 0:
             raise DecompressionError(
                 f"it inflates from {packed} to {unpacked} bytes; {LARGEST_RATIO} times are allowed"
             )
-        self.left = left
+        self.left = allowed_bytes
 
 
 class Records(NamedTuple):

@@ -268,18 +268,18 @@ class McapFile(ChunkedFile):
         memory = next(spaces)
         while True:
             opcode, length = self._head(at)
-            left = self._size - at - _HEAD_BYTES
+            remaining = self._size - at - _HEAD_BYTES
             if opcode in (_FOOTER, _DATA_END):
                 return
             if opcode == _CHUNK:
-                chunk = Chunk(at + _HEAD_BYTES, min(length, left), is_cut=length > left)
+                chunk = Chunk(at + _HEAD_BYTES, min(length, remaining), is_cut=length > remaining)
                 if (yield from self._read_chunk(Part(chunk), memory)):
                     memory = next(spaces)
-            elif opcode in (_SCHEMA, _CHANNEL, _MESSAGE) and length <= left:
+            elif opcode in (_SCHEMA, _CHANNEL, _MESSAGE) and length <= remaining:
                 block, length = self._read_loose(at, length)
                 if block is not None:
                     yield block
-            if opcode == 0 or length > left:
+            if opcode == 0 or length > remaining:
                 break
             at += _HEAD_BYTES + length
         self.report("log_cut_off", f"cut off or damaged at byte {at} of {self._size}; everything before it was read")

@@ -111,12 +111,12 @@ FileState = tuple[int, int, int]
 
 def states_of(path: Path) -> dict[str, FileState]:
     """Return by path what changes when a file of a log is written to; nothing for an address."""
-    found: dict[str, FileState] = {}
+    states: dict[str, FileState] = {}
     for file in () if isinstance(path, UrlPath) else files_of_log(path):
         with suppress(OSError):
             status = file.stat()
-            found[str(file)] = status.st_ino, status.st_size, status.st_mtime_ns
-    return found
+            states[str(file)] = status.st_ino, status.st_size, status.st_mtime_ns
+    return states
 
 
 def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterable[InputFile]) -> None:
@@ -409,6 +409,8 @@ class BagDirectory(Container):
                     count = (known.count or 0) + (channel.count or 0) if both else None
                     merged[key] = replace(known, count=count, definition=known.definition or channel.definition)
                 numbers[channel.id] = merged[key].id
-            own = np.array(sorted(numbers), np.int64)
-            self._numbers.append((own, np.array([numbers[number] for number in own.tolist()], np.int64)))
+            numbers_of_part = np.array(sorted(numbers), np.int64)
+            self._numbers.append(
+                (numbers_of_part, np.array([numbers[number] for number in numbers_of_part.tolist()], np.int64))
+            )
         return list(merged.values())

@@ -59,19 +59,19 @@ def storage_files(directory: Path) -> list[Path]:
         There is none, or there are recordings of several kinds: the user must name one.
     """
     entries = sorted(directory.iterdir(), key=natural_order)
-    found = [entry for entry in entries if STORAGE.search(entry.name) and entry.is_file()]
+    storage = [entry for entry in entries if STORAGE.search(entry.name) and entry.is_file()]
     others = [
         entry
         for entry in entries
         if (entry / "metadata.yaml").is_file() or (entry.suffix == ".bag" and entry.is_file())
     ]
-    kinds = {match[1] for file in found if (match := STORAGE.search(file.name))}
+    kinds = {match[1] for file in storage if (match := STORAGE.search(file.name))}
     if len(kinds) == 1 and not others:
-        return found
-    if not found and len(others) == 1:
+        return storage
+    if not storage and len(others) == 1:
         raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} is in it", "name that file")
-    if found or others:
-        why = f"holds more than one recording: {listed([entry.name for entry in (*found, *others)])}"
+    if storage or others:
+        why = f"holds more than one recording: {listed([entry.name for entry in (*storage, *others)])}"
         raise LogError(directory, why, "name one of them")
     if (directory / "run.json").is_file():
         raise LogError(directory, "is a run, not a log", "icrtool dropout-report reads it; or name the log itself")
@@ -125,9 +125,9 @@ def bag_files(directory: Path, report: Callable[[str, str], None]) -> BagFiles:
     for name in (Path(one).name for one in names):
         # a file may have been unpacked since
         stored = [directory / name, directory / unpacked_name(name)]
-        found = next((one for one in stored if os.path.isfile(one)), None)  # noqa: PTH113 - also of a name that is too long
-        if found is not None:
-            there[found] = None
+        existing = next((one for one in stored if os.path.isfile(one)), None)  # noqa: PTH113 - also of a name that is too long
+        if existing is not None:
+            there[existing] = None
         else:
             missing[stored[0].name] = None
     if missing:
@@ -319,9 +319,11 @@ def log_name(path: Path) -> str:
     if path == STANDARD_INPUT:
         return "stdin"
     files = split_files(path)
-    named = path if isinstance(path, UrlPath) else Path(os.path.normpath((files[0] if files else path).absolute()))
-    name = named.name
-    if not named.is_dir():
+    path_of_name = (
+        path if isinstance(path, UrlPath) else Path(os.path.normpath((files[0] if files else path).absolute()))
+    )
+    name = path_of_name.name
+    if not path_of_name.is_dir():
         plain = unpacked_name(name)
         name = Path(plain).stem if plain == name or Path(plain).suffix in {*LOG_SUFFIXES, ".csv"} else plain
     return name if name.strip(".") else "log"

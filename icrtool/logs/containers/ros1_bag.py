@@ -101,12 +101,12 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
     starts, stop = record_starts(data, begin, hint, _behind_record, _record_ends)
     sizes = values_at_each_byte(data, "<u4")[starts] + np.int64(8)
     table = np.empty((5, len(starts)), np.int64)
-    left, rounds = np.arange(len(starts)), 0
-    while len(left):
+    unread, rounds = np.arange(len(starts)), 0
+    while len(unread):
         # Most records have headers of the same fields.
-        size = int(sizes[left[0]])
-        fits = sizes[left] == size if rounds < _MOST_HEADERS else np.arange(len(left)) == 0
-        heads = values_at_each_byte(data, f"V{size}")[starts[left if fits.all() else left[fits]]]
+        size = int(sizes[unread[0]])
+        fits = sizes[unread] == size if rounds < _MOST_HEADERS else np.arange(len(unread)) == 0
+        heads = values_at_each_byte(data, f"V{size}")[starts[unread if fits.all() else unread[fits]]]
         header = heads[0].tobytes()[4:-4]
         values = [(name, begin + 4) for name, begin, end in _fields(header) if end - begin == _VALUE_BYTES.get(name)]
         fields = {name: at for name, at in values if at + _VALUE_BYTES[name] <= size - 4}
@@ -121,7 +121,7 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
         if not same.all():
             fits[fits] = same
             heads = heads[same]
-        rows = slice(None) if len(heads) == len(starts) else left[fits]
+        rows = slice(None) if len(heads) == len(starts) else unread[fits]
         table[0, rows] = _strided(heads, fields[b"op"], "u1") if b"op" in fields else 0
         table[1, rows] = _strided(heads, fields[b"conn"], "<u4") if b"conn" in fields else -1
         table[2, rows] = 0
@@ -130,7 +130,7 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
             table[2, rows] = seconds * np.int64(1_000_000_000) + nanoseconds
         table[3, rows] = starts[rows] + size
         table[4, rows] = table[3, rows] + _strided(heads, size - 4, "<u4")
-        left, rounds = left[~fits], rounds + 1
+        unread, rounds = unread[~fits], rounds + 1
     codes, messages = table[0], table[1:]
     is_message = codes == _BAG_MESSAGE
     others = [

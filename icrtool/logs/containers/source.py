@@ -172,8 +172,8 @@ class RemoteFile:
         async def all_of_them() -> list[bytes]:
             return list(await asyncio.gather(*map(one, begins, ends)))
 
-        found: list[bytes] = sync(self._files.loop, all_of_them)
-        return found
+        pieces_of_all: list[bytes] = sync(self._files.loop, all_of_them)
+        return pieces_of_all
 
     def read_at(self, at: int, count: int) -> bytes:
         """Return bytes of the file, as many as there are."""
@@ -290,9 +290,9 @@ class SavedBytes(NamedTuple):
     @classmethod
     def into(cls, folder: Path) -> SavedBytes:
         """Return the limit for a folder: that of `most_bytes`, else half of the free space."""
-        given = most_bytes()
-        if given is not None:
-            return cls(given, "--most-bytes")
+        limit = most_bytes()
+        if limit is not None:
+            return cls(limit, "--most-bytes")
         return cls(shutil.disk_usage(folder).free // 2, "half of the free space in the temporary folder")
 
     def check(self, path: Path, count: int) -> None:
@@ -318,9 +318,9 @@ def read_by_ranges(files: Collection[RemoteFile]) -> str:
 def version_of(about: dict[str, Any]) -> dict[str, str]:
     """Return what a store states of the content of a file: its version, else its etag, else nothing."""
     for key, names in (("version", ("VersionId", "generation")), ("etag", ("ETag", "etag", "Last-Modified"))):
-        stated = next((str(about[name]) for name in names if about.get(name)), "null")
-        if stated != "null":
-            return {key: stated.strip('"')}
+        version = next((str(about[name]) for name in names if about.get(name)), "null")
+        if version != "null":
+            return {key: version.strip('"')}
     return {}
 
 
@@ -336,18 +336,18 @@ def _in_folder(path: UrlPath) -> list[tuple[UrlPath, dict[str, Any]]]:
     """Return the addresses of the files in a folder, and what a store states about them now."""
     files, name = filesystem(path)
     files.invalidate_cache(name)
-    found: list[dict[str, Any]] = ask_server(path, lambda: files.ls(name, detail=True))
-    return [(_address(files, one["name"], path), one) for one in found]
+    entries: list[dict[str, Any]] = ask_server(path, lambda: files.ls(name, detail=True))
+    return [(_address(files, one["name"], path), one) for one in entries]
 
 
 def _address(files: Any, name: str, asked_for: UrlPath) -> UrlPath:  # noqa: ANN401 - a file system of fsspec
     """Return the address of a found file, with the query of `asked_for` where a web server needs it."""
     url = files.unstrip_protocol(name)
     query = asked_for.url.partition("?")[2] if asked_for.scheme.startswith("http") else ""
-    found = place_of(f"{url}?{query}" if query and "?" not in url else url)
-    if not isinstance(found, UrlPath):
-        raise LogError(asked_for, "is no address", str(found))
-    return found
+    place = place_of(f"{url}?{query}" if query and "?" not in url else url)
+    if not isinstance(place, UrlPath):
+        raise LogError(asked_for, "is no address", str(place))
+    return place
 
 
 def changed_since(path: UrlPath, inputs: Iterable[InputFile]) -> bool:
@@ -379,11 +379,11 @@ def find_logs_at(path: UrlPath) -> list[UrlPath]:
     address = without_secrets(path.url) if path.scheme.startswith("http") else path.url
     wild = r"[*\[]" if path.scheme.startswith("http") else r"[*?\[]"
     if not re.search(wild, address) or (not re.search(wild.replace("\\[", ""), address) and _is_there(path)):
-        found = _below(path) if RemoteFile(path).is_folder else [path]
-        if not found:
+        logs = _below(path) if RemoteFile(path).is_folder else [path]
+        if not logs:
             suffixes = ", ".join(sorted(LOG_SUFFIXES))
             raise LogError(path, "no recording in it", f"a log has one of the suffixes {suffixes}")
-        return found
+        return logs
     files, name = filesystem(path)
     # folders in folders without an end are no reason to go on for ever
     most = LARGEST_LISTING_BYTES if path.scheme.startswith("http") else LARGEST_DOCUMENT_BYTES
@@ -391,10 +391,10 @@ def find_logs_at(path: UrlPath) -> list[UrlPath]:
     found = []
     for inner, about in matched.items():
         one = _address(files, inner, path)
-        found += _below(one) if about.get("type") == "directory" else [one]
-    if not found:
+        logs += _below(one) if about.get("type") == "directory" else [one]
+    if not logs:
         raise LogError(path, "matches nothing")
-    return sorted(set(found), key=natural_order)
+    return sorted(set(logs), key=natural_order)
 
 
 def _is_there(path: UrlPath) -> bool:
@@ -414,8 +414,8 @@ def _below(folder: UrlPath) -> list[UrlPath]:
         return [folder]
     bags = {one.rpartition("/")[0] for one in names if one.endswith("/metadata.yaml")}
     logs = {one for one in names if Path(unpacked_name(one.rpartition("/")[2])).suffix in LOG_SUFFIXES}
-    found = {parent if (parent := one.rpartition("/")[0]) in bags else one for one in logs}
-    return sorted((_address(files, one, folder) for one in found), key=natural_order)
+    recordings = {parent if (parent := one.rpartition("/")[0]) in bags else one for one in logs}
+    return sorted((_address(files, one, folder) for one in recordings), key=natural_order)
 
 
 def fetch_folder(

@@ -249,16 +249,16 @@ def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = Non
             size = path.stat().st_size
             budget = _Budget(LARGEST_CHUNK_BYTES + LARGEST_RATIO * size)
             watch = (lambda: share(file.tell() / max(size, 1))) if share is not None else None
-            found = _unpacked(path, file, folder, budget, watch)
+            logs = _unpacked(path, file, folder, budget, watch)
     except OSError as err:
         free = shutil.disk_usage(folder).free
         raise LogError(path, f"cannot be unpacked: {err.strerror}", f"{free} bytes are free for it") from err
     written = [file for file in folder.rglob("*") if file.is_file() and file.stat().st_size]
     if budget.trouble is None:
-        return found, None
+        return logs, None
     if not written:
         raise LogError(path, "does not decompress", budget.trouble.text)
-    return found, note(budget.trouble.code, f"{budget.trouble.text}; what could be unpacked was read")
+    return logs, note(budget.trouble.code, f"{budget.trouble.text}; what could be unpacked was read")
 
 
 @dataclass(slots=True)
@@ -331,8 +331,8 @@ class _Stream:
     def decompressed(self) -> _Stream:
         """Return the stream that it is when decompressed, itself where it is not compressed."""
         start = self.start()
-        made = next((decoder for magic, decoder in DECODERS.items() if start.startswith(magic)), None)
-        return self if made is None else _Stream(made(self), self._budget)
+        decoder_found = next((decoder for magic, decoder in DECODERS.items() if start.startswith(magic)), None)
+        return self if decoder_found is None else _Stream(decoder_found(self), self._budget)
 
     def write_to(self, place: Path, watch: Callable[[], None] | None) -> None:
         """Write all of it to a file."""
@@ -397,7 +397,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
     -----
     `tarfile` keeps all entries, and reads a name of any length: an archive could exhaust the memory with either.
     """
-    name, stated = "", None
+    name, stated_size = "", None
     for _ in range(_MOST_ENTRIES):
         head = stream.exactly(_TAR_BLOCK_BYTES)
         if not any(head):
@@ -411,13 +411,13 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
             fields = _extra_fields(info.type, stream.exactly(min(info.size, _LARGEST_EXTRA_BYTES)))
             stream.skip(max(info.size - _LARGEST_EXTRA_BYTES, 0) + -info.size % _TAR_BLOCK_BYTES)
             name = fields.get(b"path", name.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
-            stated = int(fields[b"size"]) if fields.get(b"size", b"").isdigit() else stated
+            stated_size = int(fields[b"size"]) if fields.get(b"size", b"").isdigit() else stated_size
             continue
         if info.type == b"K":
             # the target of a link, of any length; the name of the next entry stays
             stream.skip(info.size + -info.size % _TAR_BLOCK_BYTES)
             continue
-        size = info.size if stated is None else stated
+        size = info.size if stated_size is None else stated_size
         if info.type in {REGTYPE, AREGTYPE, CONTTYPE}:
             entry = _Stream(stream, budget, size)
             yield name or info.name, entry
@@ -434,7 +434,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
             stream.skip(size + -size % _TAR_BLOCK_BYTES)
         elif info.type not in SUPPORTED_TYPES or info.type == b"g":
             stream.skip(size + -size % _TAR_BLOCK_BYTES)
-        name, stated = "", None
+        name, stated_size = "", None
     return budget.stop("log_limit_reached", f"more than {_MOST_ENTRIES} entries")
 
 

@@ -259,12 +259,12 @@ def parse_sentences(text: bytes, *, bare: bool = False) -> dict[str, Any] | None
     lines = text.splitlines()
     # if a message is longer than the bytes that are read, its last sentence is incomplete
     for line in lines if len(text) < LONGEST_TEXT else lines[:-1]:
-        if (found := parse_sentence(line, bare=bare)) is not None:
+        if (sentence := parse_sentence(line, bare=bare)) is not None:
             whole = whole or {}
-            kinds = whole.get("sentence_kind", 0) | found.get("sentence_kind", 0)
+            kinds = whole.get("sentence_kind", 0) | sentence.get("sentence_kind", 0)
             # The position of a GGA has a height: it is preferred to the position of an RMC.
-            is_better = found.get("sentence_kind") == GGA
-            whole = ({**whole, **found} if is_better else {**found, **whole}) | (
+            is_better = sentence.get("sentence_kind") == GGA
+            whole = ({**whole, **sentence} if is_better else {**sentence, **whole}) | (
                 {"sentence_kind": kinds} if kinds else {}
             )
     return whole
@@ -279,12 +279,12 @@ def parse_sentence(text: bytes, *, bare: bool = False) -> dict[str, Any] | None:
     """
     if (long := _LONG.fullmatch(text)) is not None:
         return _parse_long(long[1].decode("ascii")) if _crc_of(long[1]) == int(long[2], 16) else None
-    found = _SENTENCE.fullmatch(text)
-    is_right = found is not None and reduce(xor, found[1]) == int(found[2], 16)
-    found = found or (_WITHOUT_CHECKSUM.fullmatch(text) if bare else None)
+    match = _SENTENCE.fullmatch(text)
+    is_right = match is not None and reduce(xor, match[1]) == int(match[2], 16)
+    match = match or (_WITHOUT_CHECKSUM.fullmatch(text) if bare else None)
     return (
-        _fields_of(found[1].decode("ascii"))
-        if found is not None and (is_right or found.re is _WITHOUT_CHECKSUM)
+        _fields_of(match[1].decode("ascii"))
+        if match is not None and (is_right or match.re is _WITHOUT_CHECKSUM)
         else None
     )
 

@@ -202,24 +202,24 @@ class Decoder:
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> Decoded:
         """Decode messages [start, end) (n,) of `data`: the first ones, up to the limit of shapes."""
-        size, left = end - start, np.arange(len(start))
+        size, undecoded = end - start, np.arange(len(start))
         shapes: list[Shape] = []
         shape_of = np.empty(len(start), np.int64)
-        while len(left) and len(shapes) < _SHAPES_AT_ONCE:
-            first = left[0]
+        while len(undecoded) and len(shapes) < _SHAPES_AT_ONCE:
+            first = undecoded[0]
             message = data[start[first] : end[first]].tobytes()
             # where few messages are alike, comparison takes longer than decoding
-            compare = len(shapes) < min(_COMPARED_SHAPES, _TRIED_SHAPES + (len(start) - len(left)) // 2)
+            compare = len(shapes) < min(_COMPARED_SHAPES, _TRIED_SHAPES + (len(start) - len(undecoded)) // 2)
             shape = next((one for one in self._known if one.fits(message)), None) if compare else None
             if shape is None:
                 shape = _Run(self.layout, message).shape
                 if len(self._known) < _COMPARED_SHAPES and shape.same is not None:
                     self._known.append(shape)
-            fits = np.zeros(len(left), np.bool_)
+            fits = np.zeros(len(undecoded), np.bool_)
             fits[0] = True
             if compare and shape.same is not None:
-                fits = size[left] >= shape.size if shape.readable else size[left] == shape.size
-                together = values_at_each_byte(data, np.dtype((np.void, shape.size)))[start[left[fits]]]
+                fits = size[undecoded] >= shape.size if shape.readable else size[undecoded] == shape.size
+                together = values_at_each_byte(data, np.dtype((np.void, shape.size)))[start[undecoded[fits]]]
                 alike = np.ones(len(together), np.bool_)
                 for at, content in shape.same:
                     alike &= as_first(together, at, len(content))
@@ -233,10 +233,10 @@ class Decoder:
                         np.zeros(len(start), np.int64),
                         fits,
                     )
-            shape_of[left[fits]] = len(shapes)
+            shape_of[undecoded[fits]] = len(shapes)
             shapes.append(shape)
-            left = left[~fits]
-        done = int(left[0]) if len(left) else len(start)
+            undecoded = undecoded[~fits]
+        done = int(undecoded[0]) if len(undecoded) else len(start)
         readable = np.array([shape.readable for shape in shapes], np.bool_)[shape_of[:done]]
         return self.columns(self.layout, data, start[:done][readable], shapes, shape_of[:done][readable], readable)
 

@@ -127,16 +127,16 @@ def _without_last_line(text: str, written: Literal["msg", "idl"], message_type: 
 
 def _missing(definitions: Definitions, name: str) -> str:
     """Return a type that another one contains and that is not defined; empty where all are."""
-    left, seen = [name], {name}
-    while left:
-        name = left.pop()
+    to_look_at, looked_at = [name], {name}
+    while to_look_at:
+        name = to_look_at.pop()
         if name not in definitions:
             return name
         for _, (node, detail) in definitions[name][1]:
             inner = detail[0] if int(node) > NAME else (node, detail)
-            if int(inner[0]) == NAME and inner[1] not in seen:
-                seen.add(inner[1])
-                left.append(inner[1])
+            if int(inner[0]) == NAME and inner[1] not in looked_at:
+                looked_at.add(inner[1])
+                to_look_at.append(inner[1])
     return ""
 
 
@@ -195,11 +195,11 @@ def bundled_for(encoding: str) -> Definitions:
     """Return all types that do not need a definition in the log, with the fields of ROS 1 Noetic or ROS 2 Humble."""
     from rosbags.typesys import Stores, get_typestore
 
-    known = {**standard_definitions(), **bundled_definitions()}
+    definitions = {**standard_definitions(), **bundled_definitions()}
     if encoding == "ros1":
-        known |= get_typestore(Stores.ROS1_NOETIC).fielddefs
-        known["tf/msg/tfMessage"] = known["tf2_msgs/msg/TFMessage"]
-    return known
+        definitions |= get_typestore(Stores.ROS1_NOETIC).fielddefs
+        definitions["tf/msg/tfMessage"] = definitions["tf2_msgs/msg/TFMessage"]
+    return definitions
 
 
 class Operation(NamedTuple):

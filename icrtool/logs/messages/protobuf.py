@@ -85,7 +85,7 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
         files = FileDescriptorSet.FromString(text.encode("latin-1")).file
     except (DecodeError, UnicodeDecodeError, RecursionError) as err:
         raise DefinitionError(message_type, "the schema in the log is no FileDescriptorSet") from err
-    found: dict[str, list[ProtobufField]] = {}
+    descriptors: dict[str, list[ProtobufField]] = {}
     parts, names = 0, FieldNames(message_type)
     for file in files[:MOST_FIELDS]:
         prefix = f"{_name(file.package)}." if file.package else ""
@@ -96,7 +96,7 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
             for one in message.field:
                 names.add(name, _name(one.name))
                 names.add(_name(one.type_name))
-            found[name] = [
+            descriptors[name] = [
                 ProtobufField(
                     name=_name(one.name),
                     number=one.number,
@@ -109,9 +109,9 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
                 for one in message.field
                 if one.HasField("type") and (one.type in SCALAR_TYPES or one.type == _MESSAGE_TYPE)
             ]
-    if message_type not in found:
+    if message_type not in descriptors:
         raise DefinitionError(message_type, "the schema in the log lacks it")
-    return found
+    return descriptors
 
 
 def _name(text: str | bytes) -> str:

@@ -224,11 +224,11 @@ class TopicCollector:
     def feed(self, block: MessageBlock, number: int) -> None:
         """Add the messages of a block whose channel is `number`."""
         decoder, expected = self.decoders[number], self.channel.count or 0
-        left = np.flatnonzero(block.channel == number)
-        while len(left):
-            some = left[:_MESSAGES_AT_ONCE]
+        unread = np.flatnonzero(block.channel == number)
+        while len(unread):
+            some = unread[:_MESSAGES_AT_ONCE]
             decoded = decoder.decode(block.data, block.start[some], block.end[some])
-            rows, left = np.split(left, [len(decoded.readable)])
+            rows, unread = np.split(unread, [len(decoded.readable)])
             readable = rows[decoded.readable]
             self._unreadable += len(rows) - len(readable)
             if not len(readable):

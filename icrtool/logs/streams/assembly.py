@@ -115,7 +115,7 @@ def _lost(survey: Survey) -> str:
 
 def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     """Return the log with the streams of a choice, converted."""
-    found, name = survey.candidates, survey.name
+    candidates, name = survey.candidates, survey.name
     motion, position, source = choice.wheels, choice.gnss, choice.heading
     chosen: dict[Role, Source] = {"wheels": motion, "gnss": position}
     if source is not None:
@@ -141,7 +141,9 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     notes += wheel_notes + ignored_joints(motion, config)
     notes += [note(reported.code, f"{one.topic}: {reported.text}") for one in chosen.values() for reported in one.notes]
     if source is None:
-        notes += [note("heading_unusable", f"{one.topic} gives no heading: {one.problem}") for one in found.heading]
+        notes += [
+            note("heading_unusable", f"{one.topic} gives no heading: {one.problem}") for one in candidates.heading
+        ]
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     used_topics = [topic_of_side(side) for one in chosen.values() for side in one.topic.split(" + ")]
     notes += [
@@ -163,14 +165,16 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         rate, jitter = rate_and_jitter(samples.stamp_ns)
         streams.append(StreamChoice(role, one.topic, one.message_type, count, rate, used, jitter, one.why + detail))
     # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
-    others = [one for one in found.gnss if one.geodetic is not None and not one.problem and one.topic != position.topic]
+    others = [
+        one for one in candidates.gnss if one.geodetic is not None and not one.problem and one.topic != position.topic
+    ]
     others = [replace(one, stamps=retime(one.stamps)) for one in others]
     receivers = [OtherReceiver(one.topic, _fixes(one, config, clock, datum)[0]) for one in others if datum is not None]
-    known: dict[str, StampedRows] = {
+    rows_of_role: dict[str, StampedRows] = {
         table.topic: retime(stamp_rows(table)) for table in survey.tables if table.message_type == GYRO_TYPE
     }
-    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, known)
-    gyros, degrees = _gyros(inertial_units(survey.tables, GYRO_AXES, clock, known), heading, gnss)
+    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, rows_of_role)
+    gyros, degrees = _gyros(inertial_units(survey.tables, GYRO_AXES, clock, rows_of_role), heading, gnss)
     if gyro is not None and gyro.topic in degrees:
         gyro = replace(gyro, rate_radps=gyro.rate_radps * DEGREE)
     gyro = None if gyro is not None and is_too_fast(gyro.rate_radps[:, None]) else gyro
@@ -256,10 +260,10 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
             yield note("clock_set", reported)
         else:
             raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
-    if found := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:
-        size_ns, is_back, before_ns = max(found)[0]
+    if clocks_set := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:
+        size_ns, is_back, before_ns = max(clocks_set)[0]
         sense, setting = ("back", "back") if is_back else ("ahead", "forward")
-        moment, roles = np.datetime64(before_ns // 10**9, "s"), ", ".join(role for _, role in found)
+        moment, roles = np.datetime64(before_ns // 10**9, "s"), ", ".join(role for _, role in clocks_set)
         why = f"header stamps go {sense} by {size_ns / 1e9:.1f} s after {moment}Z ({roles})"
         moved = "the later stamps are moved by that step, which log time shows"
         yield note("clock_set", f"{why}: their clock was set {setting} while recording; {moved}")
@@ -511,10 +515,10 @@ def longest_part(log: RobotLog) -> RobotLog:
     for role, margin_ns in (("wheels", 0), ("gnss", pause_ns), ("heading", pause_ns)):
         samples: Samples = getattr(log, role)
         inside = (samples.stamp_ns >= first - margin_ns) & (samples.stamp_ns <= last + margin_ns)
-        kept = parts[role] = samples if inside.all() else samples.cut(inside)
-        if kept is not samples:
-            lost.append(f"{len(inside) - len(kept.stamp_ns)} of {len(inside)} ({role})")
-        longest_s = np.diff(kept.stamp_ns).max(initial=0) / 1e9
+        samples_kept = parts[role] = samples if inside.all() else samples.cut(inside)
+        if samples_kept is not samples:
+            lost.append(f"{len(inside) - len(samples_kept.stamp_ns)} of {len(inside)} ({role})")
+        longest_s = np.diff(samples_kept.stamp_ns).max(initial=0) / 1e9
         if longest_s > PAUSE_S:
             why = "the recording was paused, or its clock was set forward"
             paused.append(note("recording_paused", f"{role}: no samples for {longest_s:.0f} s: {why}"))

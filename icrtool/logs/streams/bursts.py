@@ -43,10 +43,10 @@ class Bursts(NamedTuple):
         if not self.samples:
             return ""
         if self.shared:
-            found = f"{of} share their stamps, {self.samples} at a time, {self.apart_ns / 1e6:.0f} ms apart"
-            return f"{found}: the stamps are spread over the time until the next ones"
-        found = f"{of} arrive in bursts of {self.samples}, {self.apart_ns / 1e6:.0f} ms apart"
-        return f"{found}: the stamps of each burst are spread over the time since the one before"
+            finding = f"{of} share their stamps, {self.samples} at a time, {self.apart_ns / 1e6:.0f} ms apart"
+            return f"{finding}: the stamps are spread over the time until the next ones"
+        finding = f"{of} arrive in bursts of {self.samples}, {self.apart_ns / 1e6:.0f} ms apart"
+        return f"{finding}: the stamps of each burst are spread over the time since the one before"
 
 
 def spread_bursts(stamp_ns: Ints) -> Bursts:
@@ -98,16 +98,16 @@ def spread_positions(stamp_ns: Ints, place: Complexes, *, measured: bool) -> Bur
     place : (n,) positions in one plane [m]
     measured : the stamps are of the measurements, not of their arrival: those that are equal were rounded down
     """
-    found = spread_bursts(stamp_ns)
-    if not found.samples:
-        return found
-    order = np.argsort(found.stamp_ns, kind="stable")
+    bursts = spread_bursts(stamp_ns)
+    if not bursts.samples:
+        return bursts
+    order = np.argsort(bursts.stamp_ns, kind="stable")
     step = np.abs(np.diff(place[order]))
     step = np.minimum(step, np.quantile(step, LARGEST_STEPS))
-    within = np.diff(found.stamp_ns[order]) > np.diff(np.sort(stamp_ns))
+    within = np.diff(bursts.stamp_ns[order]) > np.diff(np.sort(stamp_ns))
     if not (within.any() and (~within).any() and step[within].mean() > EVEN_STEP * step[~within].mean()):
         return Bursts(stamp_ns, 0, 0)
     if measured and float((np.diff(np.sort(stamp_ns))[within] == 0).mean()) > EVEN_STEP:
-        later = found.apart_ns - found.apart_ns // found.samples
-        return found._replace(stamp_ns=found.stamp_ns + later, shared=True)
-    return found
+        later = bursts.apart_ns - bursts.apart_ns // bursts.samples
+        return bursts._replace(stamp_ns=bursts.stamp_ns + later, shared=True)
+    return bursts

@@ -54,8 +54,8 @@ class Modulus(NamedTuple):
     @property
     def text(self) -> str:
         """The modulus in words."""
-        known = {360.0: "360 deg", 2 * np.pi: "2 pi rad"}
-        return known.get(self.value, f"{self.value:.6g}") + (f" ± {self.std:.2g}" if self.std else "")
+        words = {360.0: "360 deg", 2 * np.pi: "2 pi rad"}
+        return words.get(self.value, f"{self.value:.6g}") + (f" ± {self.std:.2g}" if self.std else "")
 
 
 class _Wraps(NamedTuple):
@@ -86,24 +86,29 @@ def find_modulus(columns: Iterable[NDArray[Any]], given: float | None = None) ->
     given : the encoder counts of a turn, which are tried before powers of two
     """
     arrays = [np.asarray(column) for column in columns]
-    found = [wraps for column in arrays if (wraps := _wraps_of(column.astype(np.float64))) is not None]
-    if not found:
+    wraps_of_columns = [wraps for column in arrays if (wraps := _wraps_of(column.astype(np.float64))) is not None]
+    if not wraps_of_columns:
         return None
-    moduli, spread = np.concatenate([one.moduli for one in found]), np.concatenate([one.spread for one in found])
+    moduli, spread = (
+        np.concatenate([one.moduli for one in wraps_of_columns]),
+        np.concatenate([one.spread for one in wraps_of_columns]),
+    )
     modulus = float(np.median(moduli))
     whole = all(column.dtype.kind != "f" or not np.any(np.mod(column[np.isfinite(column)], 1.0)) for column in arrays)
-    extent = max(one.extent for one in found)
+    extent = max(one.extent for one in wraps_of_columns)
     margin = 2.0 * float(np.median(spread)) + (1.0 if whole else 1e-6 * modulus)
     if np.mean(np.abs(moduli - modulus) <= 2.0 * spread + margin) < CONSISTENT_SHARE:
         return None
-    count, passages = len(moduli), max(len(one.moduli) for one in found)
-    if passages > 1 and sum(one.between for one in found) < BETWEEN_WRAPS * sum(len(one.moduli) - 1 for one in found):
+    count, passages = len(moduli), max(len(one.moduli) for one in wraps_of_columns)
+    if passages > 1 and sum(one.between for one in wraps_of_columns) < BETWEEN_WRAPS * sum(
+        len(one.moduli) - 1 for one in wraps_of_columns
+    ):
         return None
     std = float(np.median(np.abs(moduli - modulus))) * 1.5 / np.sqrt(count) + float(np.median(spread)) / count
     lowest = extent + (1.0 if whole else 0.0)
     least, most = max(lowest, modulus - 3 * std), max(lowest + margin, modulus + 3 * std)
-    if (known := _known_between(least, most, given, whole=whole)) is not None:
-        return Modulus(known)
+    if (usual := _known_between(least, most, given, whole=whole)) is not None:
+        return Modulus(usual)
     if passages < FEWEST_PASSAGES or not whole:
         return None
     rounded = (float(np.ceil(least / step) * step) for step in ROUND_STEPS)
@@ -133,8 +138,8 @@ def _wraps_of(values: Floats) -> _Wraps | None:
     small = np.where(large, np.nan, steps)
     before, after = (small[np.clip(rows + side, 0, len(steps) - 1)] for side in (-1, 1))
     neighbours = np.column_stack([before, after])
-    known = np.isfinite(neighbours).any(axis=1)
-    rows, neighbours = rows[known], neighbours[known]
+    has_neighbours = np.isfinite(neighbours).any(axis=1)
+    rows, neighbours = rows[has_neighbours], neighbours[has_neighbours]
     if not len(rows):
         return None
     filled = np.where(np.isfinite(neighbours), neighbours, neighbours[:, ::-1])

@@ -49,11 +49,11 @@ def is_in_degrees(t_ns: Ints, rates: Floats, heading: HeadingSamples, fixes: Pos
     for begin, end, turn, half_turns in (_turns_of_heading(heading), _turns_of_course(fixes)):
         inside = (begin >= t_ns[0]) & (end <= t_ns[-1])
         if np.count_nonzero(inside) >= FEWEST_TURNS_OF_GYRO:
-            found = [
+            agreements = [
                 _agreement(t_ns, rates * unit, begin[inside], end[inside], turn[inside], half_turns)
                 for unit in (DEGREE, 1.0)
             ]
-            in_degrees, in_radians = (1.0 - one for one in found)
+            in_degrees, in_radians = (1.0 - one for one in agreements)
             clearer = in_radians > LEAST_SCATTER and in_degrees < CLEARER * in_radians
             return in_degrees < 1.0 - AGREE and (fast or clearer)
     return fast

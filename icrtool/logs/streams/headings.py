@@ -248,7 +248,7 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     usable = np.abs(off, out=off) < QUATERNION_NORM_TOLERANCE
     del off
     norm[~usable] = np.nan
-    places, found = _written_order(q, norm, usable, yaw_rate_radps)
+    places, notes = _written_order(q, norm, usable, yaw_rate_radps)
     ordered = [q[place] for place in places]
 
     def tilt(axis: int) -> float:
@@ -259,17 +259,17 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     if tilt(2) < UPRIGHT_COSINE:
         level = min(range(3), key=tilt)
         used = "is level and is used as heading, with an offset to be estimated"
-        found = note("heading_mounting", f"mounted on its side: its {'xyz'[level]} axis {used}")
-    return _of_rows(partial(_bearing, level), ordered, norm), usable, found
+        notes = note("heading_mounting", f"mounted on its side: its {'xyz'[level]} axis {used}")
+    return _of_rows(partial(_bearing, level), ordered, norm), usable, notes
 
 
 def _of_rows(make: Callable[..., Floats], q: Sequence[Floats], norm: Floats | float = 1.0) -> Floats:
     """Return the result (n,) of a function of four columns over their norm, computed in parts to bound memory."""
-    found, norms = np.empty(len(q[0])), np.broadcast_to(norm, len(q[0]))
-    for lo in range(0, len(found), ROWS_AT_ONCE):
+    scaled, norms = np.empty(len(q[0])), np.broadcast_to(norm, len(q[0]))
+    for lo in range(0, len(scaled), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE)
-        found[some] = make(*(field[some] / norms[some] for field in q))
-    return found
+        scaled[some] = make(*(field[some] / norms[some] for field in q))
+    return scaled
 
 
 def _bearing(axis: int, x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
@@ -339,11 +339,11 @@ def find_gyro(
     known : stamps of topics that were computed before
     """
     home = wheels_topic.strip("/").split("/")[0]
-    found = []
+    gyros = []
     for table, stamps, (rate,) in inertial_units(tables, GYRO_AXES[2:], clock, known):
         near = table.topic == heading_topic, table.topic.strip("/").split("/")[0] == home, len(table)
-        found.append((near, table.topic, stamps, rate if frame_convention(table)[0] == "ned" else -rate))
-    return GyroSamples(*max(found, key=lambda one: one[:2])[1:]) if found else None
+        gyros.append((near, table.topic, stamps, rate if frame_convention(table)[0] == "ned" else -rate))
+    return GyroSamples(*max(gyros, key=lambda one: one[:2])[1:]) if gyros else None
 
 
 def inertial_units(

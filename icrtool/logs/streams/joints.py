@@ -42,10 +42,10 @@ class Joints:
     def read(self, table: TopicTable, config: Config) -> WheelSource:
         """Return the motion of the joints that are wheels."""
         codes, texts = table.words(self.names)
-        given = config.wheels.left_joints, config.wheels.right_joints
+        configured_names = config.wheels.left_joints, config.wheels.right_joints
         left, right = (
             [i for i, name in enumerate(texts) if name in configured] if configured else named
-            for configured, named in zip(given, wheel_joints(texts), strict=True)
+            for configured, named in zip(configured_names, wheel_joints(texts), strict=True)
         )
         lefts, names, problem = len(left), [texts[i] for i in left + right], ""
         if not (left and right):
@@ -59,11 +59,11 @@ class Joints:
         places, alike = _places_of(left, right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
         why = f"{self.what}: left {listed(names[:lefts])}, right {listed(names[lefts:])}"
         paths: dict[Quantity, str] = {"position": self.position, "speed": self.speed}
-        found = _by_message(table, paths, places, alike) if alike.any() else _by_own_messages(table, paths, places)
-        if found is None:
+        wheels = _by_message(table, paths, places, alike) if alike.any() else _by_own_messages(table, paths, places)
+        if wheels is None:
             problem = "the joints of the left and of the right were not recorded at the same time"
             return WheelSource(**of_topic(table), joints=tuple(texts), problem=problem)
-        columns, source, notes = found
+        columns, source, notes = wheels
         motion = of_wheels(
             lambda quantity: columns[quantity], lefts, names, "rad", **source, joints=tuple(texts), score=self.worth,
             why=why,

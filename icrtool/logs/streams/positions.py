@@ -203,13 +203,13 @@ class Fix:
         variance = np.full((len(table), 3), np.nan)
         if self.std:
             north, east = number_of(table, self.std[0]), number_of(table, self.std[-1])
-            stated = (north > 0) & (east > 0)
+            has_variance = (north > 0) & (east > 0)
             with np.errstate(over="ignore"):
-                variance[stated] = np.column_stack([north**2, east**2, np.zeros(len(table))])[stated]
+                variance[has_variance] = np.column_stack([north**2, east**2, np.zeros(len(table))])[has_variance]
         if self.covariance:
-            found = np.column_stack([number_of(table, one) for one in self.covariance])
-            stated = (found[:, 0] > 0) & (found[:, 1] > 0) & all_valid(table, self.stated)
-            variance[stated] = found[stated]
+            diagonal = np.column_stack([number_of(table, one) for one in self.covariance])
+            has_variance = (diagonal[:, 0] > 0) & (diagonal[:, 1] > 0) & all_valid(table, self.stated)
+            variance[has_variance] = diagonal[has_variance]
         return variance
 
     def _worth(self, places_deg: Floats, variance: Floats) -> tuple[float, str]:
@@ -225,7 +225,7 @@ class Fix:
     def _problem(self, table: TopicTable, places: Floats) -> str:
         """Return why positions x, y, z (n, 3) are no reference, empty where they may be one."""
         frame = table.text(FRAME_FIELD).lstrip("/")
-        named = REFERENCE_WORDS.search(f"{table.topic} {frame}") or frame in REFERENCE_FRAMES
+        is_reference = REFERENCE_WORDS.search(f"{table.topic} {frame}") or frame in REFERENCE_FRAMES
         problem = ""
         if not len(places):
             problem = "no usable fix" if self.valid else "no finite position"
@@ -237,7 +237,7 @@ class Fix:
             problem = "its positions lie in a plane that stands upright: z is not up, as in a camera's optical frame"
         elif GOAL_WORDS.search(table.topic):
             problem = GOAL
-        elif not named and (self.odometry or "odom" in table.topic.lower()):
+        elif not is_reference and (self.odometry or "odom" in table.topic.lower()):
             problem = (
                 "its name and frame do not show a position reference: it may be the wheels' dead reckoning; "
                 "topics.gnss names it if it is a reference"
@@ -466,12 +466,12 @@ def _links(table: TopicTable) -> dict[str, _Link]:
     all_rows, all_places = np.nonzero((children >= 0) & sound)
     order = np.argsort(children[all_rows, all_places], kind="stable")
     ends = np.cumsum(np.bincount(children[all_rows, all_places], minlength=len(child_names)))
-    found: dict[str, _Link] = {}
+    links: dict[str, _Link] = {}
     for name, of_child in zip(child_names, np.split(order, ends[:-1]), strict=True):
         if len(of_child):
             rows, places = all_rows[of_child], all_places[of_child]
             pose = numbers[rows, places]
             parent = LogText(parent_names[parents[rows[-1], places[-1]]].strip("/"))
             turn = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1)[:, None]
-            found[name.strip("/")] = _Link(parent, rows, places, pose[:, :3], turn)
-    return found
+            links[name.strip("/")] = _Link(parent, rows, places, pose[:, :3], turn)
+    return links

@@ -41,18 +41,18 @@ class Repeats(NamedTuple):
     def text(self) -> str:
         """What is reported of it."""
         moment, back = np.datetime64(self.begin_ns // 10**9, "s"), self.back_ns / 1e9
-        found = f"from {moment}Z of log time on, header stamps go back by {back:.1f} s and all messages come again"
-        return f"{found}, {self.passes:.2g} times in all: a replay in a loop; the first pass is used"
+        finding = f"from {moment}Z of log time on, header stamps go back by {back:.1f} s and all messages come again"
+        return f"{finding}, {self.passes:.2g} times in all: a replay in a loop; the first pass is used"
 
 
 def find_repeats(tables: Sequence[TopicTable]) -> Repeats | None:
     """Return the later passes of a log in which the same messages come again; None where there are none."""
     stamped = [(table, header) for table in tables if (header := _header(table)) is not None]
-    found = [(len(table), one) for table, header in stamped if (one := _repeats_of(table, header)) is not None]
-    if not found:
+    repeats = [(len(table), one) for table, header in stamped if (one := _repeats_of(table, header)) is not None]
+    if not repeats:
         return None
-    _, largest = max(found, key=lambda one: one[0])
-    agree = [(count, one) for count, one in found if abs(one.begin_ns - largest.begin_ns) <= DISORDER_NS]
+    _, largest = max(repeats, key=lambda one: one[0])
+    agree = [(count, one) for count, one in repeats if abs(one.begin_ns - largest.begin_ns) <= DISORDER_NS]
     if sum(count for count, _ in agree) < 0.5 * sum(len(table) for table, _ in stamped):
         return None
     return largest._replace(begin_ns=min(one.begin_ns for _, one in agree))

@@ -216,7 +216,9 @@ def _other_robots(wheels: Sequence[WheelSource]) -> frozenset[str]:
     return frozenset(_namespace(w.topic) for w in alike) - {_namespace(best.topic), ""}
 
 
-def choose_streams(found: Candidates, config: Config, log: str, channels: Sequence[Channel], lost: str = "") -> Choice:
+def choose_streams(
+    candidates: Candidates, config: Config, log: str, channels: Sequence[Channel], lost: str = ""
+) -> Choice:
     """Return the source of each role; `lost`: what of the log could not be read.
 
     Raises
@@ -227,29 +229,29 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
         No candidate for one role or more; the error names them all and lists what the log holds.
     """
     topics = config.topics
-    named = topics.wheels
+    topics_of_wheels = topics.wheels
     if sides := topics.fields_of_wheels:
-        _check_sides(sides, found, log, channels)
-        named = " + ".join(sides.values())
-    wheels = _chosen(found.wheels, named)
-    check_joints(wheels, found.wheels, config)
-    _check_roles(topics, found, log, channels)
-    gnss, heading = _chosen(found.gnss, topics.gnss), _chosen(found.heading, topics.heading)
+        _check_sides(sides, candidates, log, channels)
+        topics_of_wheels = " + ".join(sides.values())
+    wheels = _chosen(candidates.wheels, topics_of_wheels)
+    check_joints(wheels, candidates.wheels, config)
+    _check_roles(topics, candidates, log, channels)
+    gnss, heading = _chosen(candidates.gnss, topics.gnss), _chosen(candidates.heading, topics.heading)
     if wheels is None or gnss is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
         missing = [role for role, source in by_role.items() if source is None]
         refused: dict[str, dict[str, None]] = {}
         for role in missing:
-            for source in found.by_role()[role]:
+            for source in candidates.by_role()[role]:
                 for topic in map(topic_of_side, source.topic.split(" + ")):
                     refused.setdefault(topic, {})[source.problem] = None
-        reasons = found.unread | {topic: ", ".join(problems) for topic, problems in refused.items()}
+        reasons = candidates.unread | {topic: ", ".join(problems) for topic, problems in refused.items()}
         needs = {ROLE_WORDS[role]: NEEDS[role] for role in missing}
         raise MissingStreamError(log, needs, _listing(channels, reasons), lost)
     return Choice(wheels, gnss, heading)
 
 
-def other_references(found: Candidates, choice: Choice, config: Config) -> tuple[Choice, ...]:
+def other_references(candidates: Candidates, choice: Choice, config: Config) -> tuple[Choice, ...]:
     """Return the choice with each other position reference that may be better than the chosen one.
 
     A pose brings its own heading; GNSS receivers next to the chosen one are no other reference. A configured topic of
@@ -257,46 +259,48 @@ def other_references(found: Candidates, choice: Choice, config: Config) -> tuple
     """
     if config.topics.gnss is not None or config.topics.heading is not None:
         return ()
-    poses = {source.topic for source in found.gnss if source.metric is not None}
-    home, others = _namespace(choice.wheels.topic), _other_robots(found.wheels)
+    poses = {source.topic for source in candidates.gnss if source.metric is not None}
+    home, others = _namespace(choice.wheels.topic), _other_robots(candidates.wheels)
     choices = []
-    for source in found.gnss:
+    for source in candidates.gnss:
         foreign = _namespace(source.topic) in others - {home} or bool(FUSED_WORDS.search(source.topic))
         same_kind = source.metric is None and choice.gnss.metric is None
         if source.topic == choice.gnss.topic or source.problem or foreign or same_kind:
             continue
-        wanted = {source.topic} if source.metric is not None else {one.topic for one in found.heading} - poses
-        heading = next((one for one in found.heading if one.topic in wanted and not one.problem), None)
+        wanted = {source.topic} if source.metric is not None else {one.topic for one in candidates.heading} - poses
+        heading = next((one for one in candidates.heading if one.topic in wanted and not one.problem), None)
         if heading is not None:
             choices.append(Choice(choice.wheels, source, heading))
     return tuple(choices[:MOST_REFERENCES])
 
 
-def _check_sides(sides: Mapping[str, str], found: Candidates, log: str, channels: Sequence[Channel]) -> None:
+def _check_sides(sides: Mapping[str, str], candidates: Candidates, log: str, channels: Sequence[Channel]) -> None:
     """Refuse a configured pair of fields, by key, that the log does not have or that cannot be used."""
     for side, name in sides.items():
         key, topic = f"topics.{side}", topic_of_side(name)
         needed = f"name the field of one side as {topic}.left or {topic}.data[0]"
-        if (kind := _type_in(log, channels, found.unread, key, topic)) not in PAIR_TYPES and topic == name:
+        if (kind := _type_in(log, channels, candidates.unread, key, topic)) not in PAIR_TYPES and topic == name:
             raise ConfigError(key, f"{topic}: {kind} is not the number of one side", needed)
-        if topic in found.unread:
-            raise ConfigError(key, f"{topic}: {found.unread[topic]}", needed)
-    if found.wheels and found.wheels[0].is_empty:
-        why = f"{found.wheels[0].topic}: {found.wheels[0].problem}"
+        if topic in candidates.unread:
+            raise ConfigError(key, f"{topic}: {candidates.unread[topic]}", needed)
+    if candidates.wheels and candidates.wheels[0].is_empty:
+        why = f"{candidates.wheels[0].topic}: {candidates.wheels[0].problem}"
         raise ConfigError(f"topics.{next(iter(sides))}", why, "name another pair")
 
 
-def _check_roles(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
+def _check_roles(topics: TopicsConfig, candidates: Candidates, log: str, channels: Sequence[Channel]) -> None:
     """Refuse a configured topic that the log does not have or that has no usable row; other problems do not count."""
-    for role, sources in found.by_role().items():
+    for role, sources in candidates.by_role().items():
         if (configured := getattr(topics, role)) is None:
             continue
         key, needed = f"topics.{role}", f"it needs {NEEDS[role]}"
-        kind = _type_in(log, channels, found.unread, key, configured)
+        kind = _type_in(log, channels, candidates.unread, key, configured)
         if not sources:
             if role == "wheels" and kind in PAIR_TYPES:
                 needed = "name both sides in topics.wheel_left and topics.wheel_right"
-            raise ConfigError(key, f"{configured}: {found.unread.get(configured, f'{kind} cannot feed it')}", needed)
+            raise ConfigError(
+                key, f"{configured}: {candidates.unread.get(configured, f'{kind} cannot feed it')}", needed
+            )
         if sources[0].is_empty:
             raise ConfigError(key, f"{configured}: {sources[0].problem or 'nothing usable in it'}", needed)
 

@@ -172,12 +172,12 @@ def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
     A step forward counts only if the delay was larger in the whole stretch before it: a connection that was slow for a
     while and then lost messages is no step of a clock.
     """
-    found = []
+    steps_found = []
     for lo in range(0, len(header), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE + 1)
         jump = np.diff(header[some])
-        found.append(lo + np.flatnonzero((jump < 0) | (jump - np.diff(log_ns[some]) > OUT_OF_ORDER_NS)))
-    steps = np.concatenate(found)
+        steps_found.append(lo + np.flatnonzero((jump < 0) | (jump - np.diff(log_ns[some]) > OUT_OF_ORDER_NS)))
+    steps = np.concatenate(steps_found)
     if not len(steps) or len(steps) > LARGEST_SHARE_BACKWARDS * len(header) + 1:
         return header, NEVER_SET
     delay = log_ns - header
@@ -207,8 +207,8 @@ def increasing_rows(stamps: Ints, usable: Bools | None = None) -> tuple[Ints | s
     """
     if usable is not None and not usable.all():
         rows = np.flatnonzero(usable)
-        kept, backwards, equal = increasing_rows(stamps[rows])
-        return rows[kept], backwards, equal
+        rows_kept, backwards, equal = increasing_rows(stamps[rows])
+        return rows[rows_kept], backwards, equal
     steps = np.diff(stamps)
     if (steps > 0).all():
         return slice(None), 0, 0
@@ -380,9 +380,9 @@ def terms_of(text: str) -> list[tuple[list[str], float, float]]:
     """
     terms = []
     for one in text.split(" + "):
-        if (found := _TERM.fullmatch(one)) is None:
+        if (match := _TERM.fullmatch(one)) is None:
             raise ValueError(f"{text!r} describes no number")
-        names, largest, units = found.groups()
+        names, largest, units = match.groups()
         unit = math.prod(UNITS[one] if one in UNITS else float(one) for one in units.split(" * ") if one)
         terms.append((names.split("|"), float(largest or "inf"), unit))
     return terms
@@ -417,9 +417,9 @@ def check_of(text: str) -> tuple[list[str], int | None, str, list[int | str], fl
     numbers or words that follow, ``!=`` none of them, ``>=`` the number; and the number in messages of drivers that
     never set the field: where all messages have this number, all are valid.
     """
-    if (found := _CHECK.fullmatch(text)) is None:
+    if (match := _CHECK.fullmatch(text)) is None:
         raise ValueError(f"{text!r} describes no check")
-    names, mask, relation, values, unset = found.groups()
+    names, mask, relation, values, unset = match.groups()
     of_any = [int(one) if one.lstrip("-").isdecimal() else one for one in values.split("|")]
     return names.split("|"), int(mask) if mask else None, relation, of_any, float(unset or "nan")
 

@@ -165,13 +165,13 @@ def _name(topic: str, path: str) -> str:
 
 def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, set[str]]:
     """Return, by channel id, the fields that may be one side, or that hold all wheels."""
-    found: dict[int, set[str]] = {channel.id: set() for channel in channels}
+    fields: dict[int, set[str]] = {channel.id: set() for channel in channels}
     if named := topics.fields_of_wheels:
         for topic, _, path in (name.partition(".") for name in named.values()):
             for channel in channels:
                 if channel.topic == topic:
-                    found[channel.id].add(column_and_places(path or "data")[0])
-        return found
+                    fields[channel.id].add(column_and_places(path or "data")[0])
+        return fields
     names: dict[str, dict[str, list[tuple[int, str]]]] = {}
     search = _Search()
     for channel in channels:
@@ -184,8 +184,8 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
             right = right_twin(left, alike)
             if right is not None or "[" in left:
                 for number, path in [*places, *alike.get(right or "", [])]:
-                    found[number].add(path)
-    return found
+                    fields[number].add(path)
+    return fields
 
 
 @dataclass(slots=True)
@@ -223,13 +223,13 @@ class _Search:
             with suppress(DefinitionError):
                 self.searched.take(channel)
                 self.fields[one] = number_fields(channel)
-        found = []
+        fields = []
         for path in self.fields[one]:
             self.paths -= len(path) + len(channel.topic)
             if self.paths < 0:
                 break
-            found.append(path)
-        return found
+            fields.append(path)
+        return fields
 
 
 def _fields_of(channel: Channel, search: _Search) -> list[str]:
@@ -263,23 +263,23 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
 def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelSource]:
     """Return the wheels made of two sides: the configured ones, or all that the names of topics and fields show."""
     topics = config.topics
-    if given := topics.fields_of_wheels:
+    if fields_named := topics.fields_of_wheels:
         by_topic: dict[str, TopicTable] = {table.topic: table for table in tables}
-        named = (name.partition(".") for name in given.values())
+        named = (name.partition(".") for name in fields_named.values())
         sides = [Side(by_topic[topic], path or "data") for topic, _, path in named if topic in by_topic]
-        motion = twist_motion if "twist_speed" in given else pair_motion
+        motion = twist_motion if "twist_speed" in fields_named else pair_motion
         return [motion(sides[0], sides[1], config)] if len(sides) == 2 else []
-    found: dict[str, dict[str, Side]] = {}
+    sides_of: dict[str, dict[str, Side]] = {}
     for table in tables:
         if table.message_type in KNOWN_TYPES or topics.wheels not in (None, table.topic):
             continue
         for path in table.columns:
             if _may_be_side(table.topic, table.message_type, path):
                 side = Side(table, path)
-                found.setdefault(table.message_type, {})[side.name] = side
+                sides_of.setdefault(table.message_type, {})[side.name] = side
     pairs = (
         (left, alike[right])
-        for alike in found.values()
+        for alike in sides_of.values()
         for name, left in alike.items()
         if (right := right_twin(name, alike)) is not None
     )
@@ -361,12 +361,12 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
 
 def twist_motion(speed: Side, turn: Side, config: Config) -> WheelSource:
     """Return the body twist of two fields, forward speed [m/s] and turn rate [rad/s], at the stamps of the speed."""
-    found = pair_motion(speed, turn, replace(config, wheels=replace(config.wheels, quantity="velocity")))
-    if found.speed is None:
-        return found
-    kind = LogText(f"{LogText(found.message_type).raw}{OWN_TWIST}")
+    motion = pair_motion(speed, turn, replace(config, wheels=replace(config.wheels, quantity="velocity")))
+    if motion.speed is None:
+        return motion
+    kind = LogText(f"{LogText(motion.message_type).raw}{OWN_TWIST}")
     why = "speed and turn rate of the body in fields of its own"
-    return replace(found, message_type=kind, twist=np.column_stack(found.speed), speed=None, why=why)
+    return replace(motion, message_type=kind, twist=np.column_stack(motion.speed), speed=None, why=why)
 
 
 def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, Ints, Ints]:

@@ -74,13 +74,13 @@ def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set
     dead: set[int] = set()
     for side in (range(lefts), range(lefts, len(columns))):
         dead |= {wheel for wheel in side if not changes[wheel] and changes[side].any()}
-        found = [columns[wheel] for wheel in side if wheel not in dead and np.isfinite(columns[wheel]).any()]
-        if len(found) > 1:
+        columns_of_side = [columns[wheel] for wheel in side if wheel not in dead and np.isfinite(columns[wheel]).any()]
+        if len(columns_of_side) > 1:
             # infinity less infinity would warn
-            finite = (np.where(np.isinf(column), np.nan, column) for column in found)
-            means.append(sum(finite, np.zeros(len(found[0]))) / len(found))
+            finite = (np.where(np.isinf(column), np.nan, column) for column in columns_of_side)
+            means.append(sum(finite, np.zeros(len(columns_of_side[0]))) / len(columns_of_side))
         else:
-            means.append(found[0].astype(np.float64) if found else None)
+            means.append(columns_of_side[0].astype(np.float64) if columns_of_side else None)
     return (means[0], means[1]), dead
 
 
@@ -104,8 +104,8 @@ _ELEMENTS = re.compile(r"\[([\d,]+)\]")
 
 def column_and_places(path: str) -> tuple[str, list[int]]:
     """Return the column that holds a field, and the places in it: ``data[0,2]`` is of ``data[*]``."""
-    found = _ELEMENTS.search(path)
-    places = [int(place) for place in found[1].split(",") if place] if found is not None else []
+    match = _ELEMENTS.search(path)
+    places = [int(place) for place in match[1].split(",") if place] if match is not None else []
     return _ELEMENTS.sub("[*]", path, count=1), places
 
 
@@ -177,7 +177,7 @@ def read_ticks(table: TopicTable, _: Config) -> WheelSource:
     axles = [place for place, both in (("f", 3), ("r", 12)) if bits & both == both] or ["r"]
     with np.errstate(invalid="ignore"):  # infinite ones of both signs have no median
         per_metre = float(np.median(table.floats("wheel_tick_factor")))
-    known = per_metre > 0
+    has_scale = per_metre > 0
     sides = [np.zeros(len(table)), np.zeros(len(table))]
     for side, axle in product((0, 1), axles):
         name = f"{axle}{'lr'[side]}"
@@ -186,8 +186,8 @@ def read_ticks(table: TopicTable, _: Config) -> WheelSource:
             raise DefinitionError(table.topic, f"its {table.message_type} has no whole numbers wheel_ticks_{name}")
         steps = np.abs(np.mod(np.diff(ticks) + _HALF_COUNTER, 2 * _HALF_COUNTER) - _HALF_COUNTER)
         sides[side][1:] += np.cumsum(np.where(direction[1:] != 0, -steps, steps)) / len(axles)
-    left, right = (side / (per_metre if known else 1.0) for side in sides)
-    unit: WheelUnit = "m" if known else "counts"
+    left, right = (side / (per_metre if has_scale else 1.0) for side in sides)
+    unit: WheelUnit = "m" if has_scale else "counts"
     why = f"ticks of the {' and '.join({'f': 'front', 'r': 'rear'}[axle] for axle in axles)} wheels"
     return motion_of(**of_topic(table), position=(left, right), unit=unit, score=90.0, why=why)
 
@@ -288,21 +288,25 @@ class Odometry(Twist):
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
         """Return the twist; where it stays 0 while the pose moves, the distance and the turn of the pose."""
-        found = self.of_twist(table)
-        if found.twist is None or wheels_move(found.twist) or not all(path in table.columns for path in ODOMETRY_POSE):
-            return found
+        wheels = self.of_twist(table)
+        if (
+            wheels.twist is None
+            or wheels_move(wheels.twist)
+            or not all(path in table.columns for path in ODOMETRY_POSE)
+        ):
+            return wheels
         travelled = travelled_by(*(table.floats(path) for path in ODOMETRY_POSE))
         if travelled is None:
-            return found
+            return wheels
         why = (
             f"{table.topic}: its twist stays 0 while its pose goes {travelled[-1, 0]:.1f} m forward: distance and turn "
             "of the pose are taken as wheel odometry; topics.wheels names another topic"
         )
-        score = found.score + NEVER_MOVES - POSE_PENALTY
+        score = wheels.score + NEVER_MOVES - POSE_PENALTY
         words = "pose of the wheel odometry (its twist stays 0), converted to wheel speeds with the track width"
         return replace(
-            found, travelled=travelled, score=score, why=words,
-            notes=(*found.notes, note("wheels_from_pose", why)),
+            wheels, travelled=travelled, score=score, why=words,
+            notes=(*wheels.notes, note("wheels_from_pose", why)),
         )  # fmt: skip
 
 
