@@ -94,7 +94,7 @@ def dropout_report_command(
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)
     report = report.configured(config)
-    further = Given(held, compared)
+    other_results = OtherResults(held, compared)
     sources, places = plan_sources(sources, place, config, printer)
     if report.score and (runs := [source for source in sources if source not in places]):
         why = f"{escaped(str(runs[0]))} is a run, which holds no poses of other topics"
@@ -110,10 +110,10 @@ def dropout_report_command(
         if number:
             printer.text("")
         with inputs.each(source) as document:
-            dropout = report_one(source, places.get(source), config, report, files, further, printer)
-            reports[str(source)] = dropout
+            result = report_one(source, places.get(source), config, report, files, other_results, printer)
+            reports[str(source)] = result
             if printer.as_json:
-                document["report"] = dropout.document
+                document["report"] = result.document
     printer.json("dropout-report", {"reports": inputs.documents})
     outcomes = [(str(source), (inputs.errors | reports)[str(source)]) for source in sources]
     exports.write(
@@ -156,16 +156,16 @@ def content_of(log: Path) -> tuple[str, ...]:
     return tuple(recording_files.file_sha256(file) for file in recording_files.files_of_log(log) if file.is_file())
 
 
-class Given(NamedTuple):
-    """What the reports are given: calibrations, and the reports of an earlier version."""
+class OtherResults(NamedTuple):
+    """Results that a report is compared with: calibrations, and the reports of an earlier version."""
 
     calibrations: tuple[Calibration, ...]
     baseline: Baseline | None
 
 
 def report_one(
-    source: Path, place: Place | None, config: Config, request: ReportRequest, files: ResultFiles, further: Given,
-    printer: Printer,
+    source: Path, place: Place | None, config: Config, request: ReportRequest, files: ResultFiles,
+    other_results: OtherResults, printer: Printer,
 ) -> DropoutReport:  # fmt: skip
     """Report on one source; `place` is the run directory of a log, None for a run."""
     with ExitStack() as stack:
@@ -178,13 +178,13 @@ def report_one(
         if request.outage_at_s and not dropout_report.forced_lengths_s(run, request):
             raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
         baseline = None
-        if further.baseline is not None:
+        if other_results.baseline is not None:
             robot = run.document.config.robot.name or ""
-            baseline = further.baseline.find(run.name, run.document.content, robot)
+            baseline = other_results.baseline.find(run.name, run.document.content, robot)
         with printer.stages(LogText(run.name)) as stages:
             report = pipeline.report_into(
                 folder, run, request, files, stages.begin, log=None if place is None else source,
-                calibrations=further.calibrations, baseline=baseline,
+                calibrations=other_results.calibrations, baseline=baseline,
             )  # fmt: skip
     if report.baseline is not None:
         printer.warn(f"{run.name}: {change}" for change in report.baseline.changes(run.document))

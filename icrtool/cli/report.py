@@ -69,7 +69,7 @@ def report_command(
       icrtool report results/
       icrtool report season.json
     """  # noqa: D301 - click reads the escape
-    further = dropout_report.Given(options.calibrations_of(calibrations, report), None)
+    other_results = dropout_report.OtherResults(options.calibrations_of(calibrations, report), None)
     config = settings.load()
     sources = sources or (run_directory.newest_run(RUNS_FOLDER),)
     if output is not None and len(sources) > 1:
@@ -89,7 +89,7 @@ def report_command(
             result = source
             if source in places:
                 files = requests.ResultFiles(overwrite=overwrite, page=output is None and not no_coordinates)
-                _report_on_log(source, places[source], config, report, files, further, printer)
+                _report_on_log(source, places[source], config, report, files, other_results, printer)
                 if files.page:
                     continue
                 result = path_of(places[source])
@@ -99,15 +99,15 @@ def report_command(
 
 def _report_on_log(
     source: Path, place: Place, config: Config, report: requests.ReportRequest, files: requests.ResultFiles,
-    further: dropout_report.Given, printer: Printer,
+    other_results: dropout_report.OtherResults, printer: Printer,
 ) -> None:  # fmt: skip
     """Print what a log shows, fitted unless its run is there, and write its run and report."""
     request = report.configured(config)
     there = run_directory.holds_run_of(path_of(place), source, config, request.fit)
     if there:
-        dropout_report.report_one(path_of(place), None, config, request, files, further, printer)
+        dropout_report.report_one(path_of(place), None, config, request, files, other_results, printer)
     else:
-        dropout_report.report_one(source, place, config, request, files, further, printer)
+        dropout_report.report_one(source, place, config, request, files, other_results, printer)
 
 
 def _write_page(source: Path, output: Path | None, *, coordinates: bool, printer: Printer) -> None:
