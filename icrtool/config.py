@@ -225,10 +225,10 @@ def parse_config(document: Mapping[str, Any]) -> Config:
             raise ConfigError(name, "unknown configuration key", f"{meant}the sections are {', '.join(SECTIONS)}")
         if not isinstance(values, Mapping):
             raise ConfigError(name, "this is a section of the configuration", _found(values))
-        known = [key.name for key in fields(SECTIONS[name])]
+        keys = [key.name for key in fields(SECTIONS[name])]
         for key, value in values.items():
-            if key not in known:
-                listed = f"{did_you_mean(key, known)}[{name}] knows {', '.join(known)}"
+            if key not in keys:
+                listed = f"{did_you_mean(key, keys)}[{name}] knows {', '.join(keys)}"
                 raise ConfigError(f"{name}.{key}", "unknown configuration key", listed)
             if flaw := _flaw(value):
                 raise ConfigError(f"{name}.{key}", flaw, _found(value))
@@ -332,17 +332,17 @@ def _parse_set(text: str) -> dict[str, Any]:
         raise ConfigError(f"--set {text}", why, advice)
     if not value.strip():
         raise ConfigError(key.strip(), "its value is empty", "leave the option out for the default")
-    found: Any = value.strip()
+    parsed: Any = value.strip()
     # As TOML reads it, with numbers as people type them (.08, 1.); else it is a text.
     for toml in (value, _BARE_POINT.sub("0", value)):
         try:
-            found = parse_toml(f"value = {toml}")["value"]
+            parsed = parse_toml(f"value = {toml}")["value"]
             break
         except RecursionError as err:
             raise ConfigError(key.strip(), "its value is nested too deeply") from err
         except ValueError:
             continue
-    return {section: {name: found}}
+    return {section: {name: parsed}}
 
 
 def _found(value: object) -> str:

@@ -121,11 +121,11 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tupl
     if config.filter.rules.corrects:
         if fit is not None and not fit.slips:
             applied = _clear_delays(heading, position, apart, together=together)
-        given = config.frames.heading_delay_s, config.frames.reference_delay_s
+        configured_s = config.frames.heading_delay_s, config.frames.reference_delay_s
         shown = [one if one.is_significant else apart for one in (heading, position)]
-        free = [one == "auto" for one in given]
+        free = [one == "auto" for one in configured_s]
         notes = _delay_notes(applied, [one.std_s for one in shown], free, together=together)
-        lags = [own if lag == "auto" else lag for own, lag in zip(applied, given, strict=True)]
+        lags = [own if lag == "auto" else lag for own, lag in zip(applied, configured_s, strict=True)]
     return StreamDelays(heading, position, apart, together, 0.0 if together else lags[0], lags[1]), notes
 
 

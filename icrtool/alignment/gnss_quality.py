@@ -161,8 +161,8 @@ def _notes(fixes: Fixes, stated: Floats, used_std: Floats, raised: dict[str, flo
     """
 
     def accuracy(rows: Bools, silent: str) -> str:
-        known = stated[rows & np.isfinite(stated) & (stated > 0)]
-        return f"±{np.median(known):.2g} m" if len(known) else silent
+        stds = stated[rows & np.isfinite(stated) & (stated > 0)]
+        return f"±{np.median(stds):.2g} m" if len(stds) else silent
 
     notes, misreported = [], fixes.misreported
     down = fixes.down_weighted & ~misreported
@@ -219,10 +219,10 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
     """
     misreported = np.zeros(len(claimed), np.bool_)
     level, moves = steps.stretches(claimed)
-    known, moving = level[np.isfinite(level)], level[np.isfinite(level) & moves]
-    if len(known) < 2:
+    levels, moving = level[np.isfinite(level)], level[np.isfinite(level) & moves]
+    if len(levels) < 2:
         return misreported
-    usual = max(float(np.median(moving if len(moving) >= 2 else known)), USUAL_M2)
+    usual = max(float(np.median(moving if len(moving) >= 2 else levels)), USUAL_M2)
     with np.errstate(invalid="ignore"):
         noisy = level > STRETCH_VARIANCE * usual
     noisy &= ~flagged[1 : 1 + len(level) * FEWEST_NOISE_STEPS].reshape(-1, FEWEST_NOISE_STEPS).any(axis=1)
@@ -246,9 +246,9 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
 
 def _moving_mean(level: Floats, width: int) -> Floats:
     """Return the mean of `level` (n,) over a window of `width` about each entry, NaN where it holds no number."""
-    kernel, known = np.ones(width), np.isfinite(level)
-    total = np.convolve(np.where(known, level, 0.0), kernel, "same")[: len(level)]
-    count = np.convolve(known.astype(np.float64), kernel, "same")[: len(level)]
+    kernel, is_known = np.ones(width), np.isfinite(level)
+    total = np.convolve(np.where(is_known, level, 0.0), kernel, "same")[: len(level)]
+    count = np.convolve(is_known.astype(np.float64), kernel, "same")[: len(level)]
     mean = np.full(len(level), np.nan)
     np.divide(total, count, out=mean, where=count > 0.5)
     return mean

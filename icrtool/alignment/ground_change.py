@@ -187,7 +187,7 @@ def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
 
 def _stretches(turns: _Turns, rows: list[int]) -> tuple[GroundStretch, ...] | None:
     """Return the stretches between rows, None where one does not show its multiplier or equals the next one."""
-    found, ratios = list[GroundStretch](), list[tuple[float, float]]()
+    stretches, ratios = list[GroundStretch](), list[tuple[float, float]]()
     for first, stop in pairwise(rows):
         part = turns.rows(first, stop)
         shown = _ratio(part)
@@ -196,14 +196,14 @@ def _stretches(turns: _Turns, rows: list[int]) -> tuple[GroundStretch, ...] | No
         ratio, std = shown
         ratios.append(shown)
         end = turns.begin[stop] if stop < len(turns.begin) else turns.begin[-1] + CHANGE_WINDOW_S
-        begin = 0.0 if not found else float(turns.begin[first])
-        known = {"multiplier": 1.0 / ratio, "multiplier_std": std / ratio**2}
-        found.append(GroundStretch(begin_s=begin, end_s=float(end), **known))
+        begin = 0.0 if not stretches else float(turns.begin[first])
+        numbers = {"multiplier": 1.0 / ratio, "multiplier_std": std / ratio**2}
+        stretches.append(GroundStretch(begin_s=begin, end_s=float(end), **numbers))
     for (before, before_std), (after, after_std) in pairwise(ratios):
         least = max(CHANGE_SIGMAS * math.hypot(before_std, after_std), CHANGE_SHARE * max(before, after))
         if abs(before - after) < least:
             return None
-    return tuple(found)
+    return tuple(stretches)
 
 
 def _ratio(turns: _Turns) -> tuple[float, float] | None:

@@ -60,9 +60,9 @@ def antenna_bearing(log: RobotLog, turn: TurnRate) -> AbsoluteHeading | None:
         good = np.abs(np.abs(line) - length) < max(5.0 * noise, 0.05 * length)
         short = length < max(SHORTEST_BASELINE_M, 4.0 * noise) or length <= baseline_m
         if not short and np.count_nonzero(good) >= len(good) / 2:
-            found = _averaged(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
+            cells = _averaged(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
             part = f"two antennas {length:.2f} m apart"
-            best, baseline_m = found._replace(std=noise / length * found.std, topic=topic, part=part), length
+            best, baseline_m = cells._replace(std=noise / length * cells.std, topic=topic, part=part), length
     return best
 
 

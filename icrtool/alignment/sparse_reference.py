@@ -137,14 +137,14 @@ def without_interpolated(log: RobotLog) -> RobotLog:
     )
     rows = np.zeros(len(stamps), np.bool_)
     rows[kept] = True
-    found = note("positions_interpolated", why, log.name)
+    finding = note("positions_interpolated", why, log.name)
     if alike:
         heading = heading.cut(rows)
     elif turns:
         rows_of_heading = np.zeros(len(turn_straight), np.bool_)
         rows_of_heading[_nodes(~turn_straight, turn_bend)] = True
         heading = heading.cut(rows_of_heading)
-    return replace(log, gnss=fixes.cut(rows), heading=heading, notes=(*log.notes, found))
+    return replace(log, gnss=fixes.cut(rows), heading=heading, notes=(*log.notes, finding))
 
 
 def _straight_turns(heading: HeadingSamples) -> tuple[Bools, Floats, bool]:

@@ -133,12 +133,12 @@ def bridge_gaps(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[Wheel
     within = np.arange(len(row)) - np.repeat(np.cumsum(steps) - steps, steps)
     length = np.append(np.diff(wheels.stamp_ns), 0)
     stamps = wheels.stamp_ns[row] + length[row] * within // steps[row]
-    found = note(
+    finding = note(
         "wheel_gaps_bridged",
         f"{np.count_nonzero(filled)} gaps in the wheel data, {interval[filled].sum():.1f} s in all, are bridged "
         "with the distance that the wheel positions show",
     )
-    return replace(wheels, stamp_ns=stamps, left=wheels.left[row], right=wheels.right[row]), found
+    return replace(wheels, stamp_ns=stamps, left=wheels.left[row], right=wheels.right[row]), finding
 
 
 def dead_or_copied(log: RobotLog) -> list[Note]:

@@ -220,8 +220,8 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
     away = np.abs(place - (np.median(place.real) + 1j * np.median(place.imag)))
     reach_m = float(np.percentile(away, 95))
     variance = (log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2
-    known = variance[np.isfinite(variance)]
-    noise_m = math.sqrt(float(np.median(known))) if len(known) else 0.0
+    stated_variance = variance[np.isfinite(variance)]
+    noise_m = math.sqrt(float(np.median(stated_variance))) if len(stated_variance) else 0.0
     moves = reach_m >= max(PARKED_M, PARKED_SIGMAS * noise_m)
     if moves and windows is None:
         return
@@ -300,11 +300,11 @@ def _metres_per_unit(
 ) -> tuple[float, str, list[Note]]:
     """Return metres per unit, its source in words, and findings where it had to be estimated."""
     radius, counts = config.robot.wheel_radius_m, config.robot.encoder_counts_per_rev
-    known: dict[WheelUnit, float] = {"m": 1.0}
+    metres_by_unit: dict[WheelUnit, float] = {"m": 1.0}
     if radius is not None:
-        known["rad"] = radius
+        metres_by_unit["rad"] = radius
         if counts is not None:
-            known["counts"] = 2 * math.pi * radius / counts
+            metres_by_unit["counts"] = 2 * math.pi * radius / counts
     unit, per = wheels.unit, "" if wheels.from_position else "/s"
     if unit == "rad" and radius is not None and not wheels.from_position and config.wheels.unit == "auto":
         scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
@@ -314,14 +314,14 @@ def _metres_per_unit(
             if scale is not None and far and abs(math.log(scale.value / value)) < OTHER_UNIT_TOLERANCE:
                 why = f"{topic} is read in {other}, not rad/s: the position reference goes as far as that"
                 return value, f" in {other} (by the position reference)", [note("wheel_unit_found", why)]
-    if unit in known:
-        return known[unit], "" if unit == "m" else f" in {unit}{per}", []
+    if unit in metres_by_unit:
+        return metres_by_unit[unit], "" if unit == "m" else f" in {unit}{per}", []
     scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
     if unit == "unknown" and scale is not None:
-        found = _recognised(scale, known, None if wheels.from_position else radius)
-        if found is not None:
-            name, value = found
-            return value, f" in {name}{per if name in known else ''} (by the position reference)", []
+        recognised = _recognised(scale, metres_by_unit, None if wheels.from_position else radius)
+        if recognised is not None:
+            name, value = recognised
+            return value, f" in {name}{per if name in metres_by_unit else ''} (by the position reference)", []
     if scale is None and unit == "unknown":
         raise ConfigError(
             "wheels.unit",

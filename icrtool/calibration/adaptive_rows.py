@@ -33,11 +33,11 @@ def prior_for(
     at those that were corrected in this log, as for row ``icr``: between five drives of one robot, recorded by one
     computer, they differ by 0.08 s.
     """
-    found = next((one for one in calibrations if not one.fitted_to(recording.sha256)), None)
-    if found is None:
+    calibration = next((one for one in calibrations if not one.fitted_to(recording.sha256)), None)
+    if calibration is None:
         return prior_of_robots(recording.width_m)
-    known = recording.corrected._replace(wheels_later_s=np.nan, gyro_later_s=np.nan)
-    return found.prior(corrected=None if refit_sensors else known, heading_source=recording.heading_source)
+    constants = recording.corrected._replace(wheels_later_s=np.nan, gyro_later_s=np.nan)
+    return calibration.prior(corrected=None if refit_sensors else constants, heading_source=recording.heading_source)
 
 
 def samples_of(recording: Recording, rows: slice = slice(None)) -> Floats:

@@ -210,8 +210,8 @@ def solve_nonnegative(matrix: Floats, y: Floats) -> Floats:
     x = above * (np.linalg.pinv(parts, hermitian=True) @ (above * target)[:, :, None])[:, :, 0]
     cost = np.einsum("si,ij,sj->s", x, scaled, x) / 2.0 - x @ target
     cost[(x < 0.0).any(axis=1)] = np.inf
-    found: Floats = x[np.argmin(cost)] / size
-    return found
+    best: Floats = x[np.argmin(cost)] / size
+    return best
 
 
 class Forecast(NamedTuple):
@@ -336,6 +336,6 @@ def forecast_errors(calibration: Calibration, windows: Windows, *, with_gyro: bo
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
-    found = path_errors(windows, fitted, calibration.width_m)
-    spread = found.of_sources.combined(np.array(astuple(sources)[:SOURCES])).plus(found.of_parameters)
+    growth = path_errors(windows, fitted, calibration.width_m)
+    spread = growth.of_sources.combined(np.array(astuple(sources)[:SOURCES])).plus(growth.of_parameters)
     return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius_of_share(spread, 0.95)

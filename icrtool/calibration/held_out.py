@@ -174,10 +174,10 @@ class HeldOut:
         base = name.removesuffix(GYRO_SUFFIX)
         if base != CONTROLLER:
             return self.fits[name].without(fold)
-        if (found := self.fits[name.replace(CONTROLLER, FIVE)].without(fold)) is None:
+        if (solution := self.fits[name.replace(CONTROLLER, FIVE)].without(fold)) is None:
             return None
         recording = self.recordings[fold.recording]
-        return controller_model(found[0], recording.lever, recording.width_m), found[1]
+        return controller_model(solution[0], recording.lever, recording.width_m), solution[1]
 
     def errors(self, name: str, i: int, trials: Trials) -> TrialErrors:
         """Return the errors of a row in trials of recording i, each predicted without the fold that it touches."""
@@ -189,9 +189,9 @@ class HeldOut:
         recording = self.recordings[i]
         ends = (recording.track.distance[row : row + 1] for row in (start, end))
         ((fold, _),) = left_out(self.folds, i, *ends)
-        if (found := self.without(name, fold)) is None:
+        if (prediction := self.without(name, fold)) is None:
             return None
-        return path_between(recording, found, self.fits[RECOMMENDED].pool.windows[i].track, start, end)
+        return path_between(recording, prediction, self.fits[RECOMMENDED].pool.windows[i].track, start, end)
 
 
 def path_between(recording: Recording, prediction: Prediction, steps: Track, start: int, end: int) -> OpenLoopPath:
@@ -266,11 +266,11 @@ def errors_without(
     column, row = np.nonzero(trials.ends.T >= 0)
     start, end = trials.starts[row], trials.ends[row, column]
     for fold, some in left_out(folds, i, distance[start], distance[end]):
-        if (found := without(fold)) is not None:
+        if (prediction := without(fold)) is not None:
             s, e = start[some], end[some]
             span = track.t[s.min()], track.t[e.max()]
             near = recording.wheels(track.rows_around(*span)) if steps is None else steps.around(*span)
-            missed = trial_errors(recording, s, e, predicted_path(recording, *found, near))
+            missed = trial_errors(recording, s, e, predicted_path(recording, *prediction, near))
             for all_errors, of_fold in zip(errors, missed, strict=True):
                 all_errors[row[some], column[some]] = of_fold
     return errors
@@ -347,27 +347,27 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     Their logarithm is shrunk towards zero (James and Stein 1961), because a short drive shows only its largest error,
     not a quantile.
     """
-    found: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
+    of_logs: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
     tested = [np.empty((0, 3))]
     for i, windows, (fitted, own) in _left_out_windows(table, name, LENGTHS_M):
         errors = error_growth.path_errors(windows, fitted, table.recordings[i].width_m, own)
         reference = np.exp(-1j * own.heading_offset_rad) * windows.moved
-        found.append((windows.length_m, errors, errors.turned - windows.turned, errors.moved - reference))
+        of_logs.append((windows.length_m, errors, errors.turned - windows.turned, errors.moved - reference))
         stretch = np.floor(windows.track.distance[windows.begin] / windows.length_m)
         tested.append(np.column_stack([np.full(len(stretch), i), windows.length_m, stretch]))
     stretches = Counter(np.unique(np.concatenate(tested), axis=0)[:, 1].tolist())
     measured_to_m = max(one for one in LENGTHS_M if one <= ALWAYS_TO_M or stretches[one] >= FEWEST_STRETCHES)
-    length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
+    length = np.concatenate([one[0] for one in of_logs]) if of_logs else np.empty(0)
     used = length <= measured_to_m
     length = length[used]
     if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_HELD_OUT_WINDOWS:
         return None
-    of_sources, of_parameters = ([getattr(one[1], part) for one in found] for part in ("of_sources", "of_parameters"))
+    of_sources, of_parameters = ([getattr(one[1], part) for one in of_logs] for part in ("of_sources", "of_parameters"))
     sources, stated = (
         error_growth.Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
         for parts in (of_sources, of_parameters)
     )
-    turned, missed = (np.concatenate([one[k] for one in found])[used] for k in (2, 3))
+    turned, missed = (np.concatenate([one[k] for one in of_logs])[used] for k in (2, 3))
     variances = error_growth.fit_variances(length, sources, stated, turned, missed)
     spread, far = sources.combined(variances).plus(stated), length >= SCALED_FROM_M
     error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)

@@ -59,8 +59,8 @@ def sensors_of(
 
 def measured_in(recording: Recording, windows: Windows, fitted: FittedModel) -> KnownConstants:
     """Return the constants that a recording's sensors had before any correction, for a model's parameters."""
-    found = measured_constants(windows, fitted, recording.width_m)
-    return KnownConstants(recording.corrected.plus(found.mean), found.std)
+    constants = measured_constants(windows, fitted, recording.width_m)
+    return KnownConstants(recording.corrected.plus(constants.mean), constants.std)
 
 
 def constants_document(constants: KnownConstants) -> documents.SensorConstants:
@@ -104,13 +104,13 @@ def pooled_constants(
     if heading_source is None and len(sources) == 1:
         (heading_source,) = sources
     of_logs = [(one.heading_source, one.gyro if with_gyro else one.wheels) for one in stored]
-    known = [(source, known_constants(one)) for source, one in of_logs if one is not None]
+    of_sources = [(source, known_constants(one)) for source, one in of_logs if one is not None]
     pairs = []
     for column, usual_std in enumerate(BETWEEN_DRIVES_STD):
         of_offset = column == 0
         some = np.array([
             (one.mean[column], one.std[column])
-            for source, one in known
+            for source, one in of_sources
             if math.isfinite(one.mean[column]) and not (of_offset and source != heading_source)
         ])  # fmt: skip
         if of_offset and len(some):

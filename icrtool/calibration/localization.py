@@ -129,7 +129,7 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
     The filter adds REFERENCE_STEP_S dt sigma^2 in dt (Pentzer 2014, Eq. 30, at any rate), robot_localization dt Q.
     """
     used, settings, configured = run.document.filter, run.config.filter, configured_noise(run.config)
-    found: dict[str, Estimate] = {}
+    estimates: dict[str, Estimate] = {}
     for names, std, unit, first, key, free in (
         (("x", "y"), used.process_position_mps, "m/s", configured.position_mps, "process_position_mps",
          settings.process_position_mps == "auto"),
@@ -141,8 +141,8 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
             how = f"raised from {first:g} by the filter's innovations"
         source = f"({std:g} {unit})² × {REFERENCE_STEP_S:g} s, filter.{key}: {how}"
         value = REFERENCE_STEP_S * (math.radians(std) if unit == "deg/s" else std) ** 2
-        found |= {name: Estimate(value, None, source) for name in names}
-    return found
+        estimates |= {name: Estimate(value, None, source) for name in names}
+    return estimates
 
 
 def _speed_noise(calibration: Calibration, run: Run) -> dict[str, Estimate]:
@@ -186,28 +186,28 @@ def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
     navsat_transform_node adds both to the yaw. Its declination is counter-clockwise: the negative of the usual one,
     which is positive where magnetic north lies east of north.
     """
-    sensor, found = run.sensors.facts.heading_sensor, run.document.heading
+    sensor, heading = run.sensors.facts.heading_sensor, run.document.heading
     fixes = next((one.message_type for one in run.document.streams if one.role == "gnss"), "")
     reason = ""
     if fixes != FIX_TYPE:
         reason = f"it reads {FIX_TYPE}, and the positions are {fixes or 'of another type'}"
-    elif sensor is None or found.source not in ("orientation", "fused"):
+    elif sensor is None or heading.source not in ("orientation", "fused"):
         reason = "no IMU of the log states a heading"
     elif sensor.message_type != IMU_TYPE:
         reason = f"it reads {IMU_TYPE}, and the heading is {sensor.message_type} ({sensor.topic})"
-    elif sensor.convention == "ned" or found.applied_mirror:
+    elif sensor.convention == "ned" or heading.applied_mirror:
         reason = f"the yaw of {sensor.topic} is clockwise (NED), and it reads ENU: convert its messages first"
-    elif found.offset_deg is None:
+    elif heading.offset_deg is None:
         reason = "the drive is too short to compare the heading with the course over ground"
     if reason or sensor is None:
         return None, None, f"navsat_transform_node: {reason}"
-    applied, std = math.radians(found.applied_offset_deg), found.offset_std_deg
-    compared = f"heading minus course over ground {found.offset_deg:+z.2f} deg, {found.windows} windows"
-    if found.applied_offset_deg == 0.0:
+    applied, std = math.radians(heading.applied_offset_deg), heading.offset_std_deg
+    compared = f"heading minus course over ground {heading.offset_deg:+z.2f} deg, {heading.windows} windows"
+    if heading.applied_offset_deg == 0.0:
         compared += ": too small to correct"
     declination = Estimate(0.0, None, "no declination shown: yaw_offset is the whole offset")
-    of_north = found.magnetic_declination_deg
-    if of_north is not None and "magnetic declination" in (found.offset_name or ""):
+    of_north = heading.magnetic_declination_deg
+    if of_north is not None and "magnetic declination" in (heading.offset_name or ""):
         words = f"World Magnetic Model: magnetic north is {of_north:+z.1f} deg east of north; the sign is that of ENU"
         declination = Estimate(-math.radians(of_north), math.radians(DECLINATION_STD_DEG), words)
         compared += ", without the declination"
@@ -219,8 +219,8 @@ def _antenna(run: Run) -> tuple[AntennaPlace | None, str]:
     """Return the place of the antenna, or what the positions show instead."""
     forward, right = known_antenna_m(run)
     if forward is not None and right is not None:
-        given = run.config.frames
-        configured = given.antenna_forward_m != "auto" or given.antenna_right_m != "auto"
+        frames = run.config.frames
+        configured = frames.antenna_forward_m != "auto" or frames.antenna_right_m != "auto"
         how = "frames.antenna_forward_m, antenna_right_m" if configured else "the log's own transforms (/tf_static)"
         return AntennaPlace(forward, -right, how), ""
     words = []

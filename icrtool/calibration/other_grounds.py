@@ -40,7 +40,7 @@ def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -
     Empty for fewer than `FEWEST_GROUNDS`. A ground without trials, or without which too short a drive is left, has no
     score.
     """
-    found: list[GroundScore] = []
+    scores: list[GroundScore] = []
     names = list(dict.fromkeys(grounds))
     if len(names) < FEWEST_GROUNDS:
         return ()
@@ -48,8 +48,8 @@ def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -
         others = [one for one, of in zip(recordings, grounds, strict=True) if of != ground]
         mine = [one for one, of in zip(recordings, grounds, strict=True) if of == ground]
         with suppress(DataError):
-            found += _scores(ground, mine, fit_models(others, (FIVE, RECOMMENDED)))
-    return tuple(found)
+            scores += _scores(ground, mine, fit_models(others, (FIVE, RECOMMENDED)))
+    return tuple(scores)
 
 
 def _scores(ground: str, recordings: Sequence[Recording], fits: Mapping[str, PooledFit]) -> Iterator[GroundScore]:
@@ -112,10 +112,10 @@ def other_ground_ends(
     for one in scores:
         if one.model == row and one.p95_m > 0.0:
             by_horizon.setdefault(one.horizon_m, []).append(one.p95_m)
-    known = {metres: p95_m for metres, p95_m in sorted(by_horizon.items()) if len(p95_m) >= FEWEST_GROUNDS}
-    if not known:
+    p95_by_horizon = {metres: p95_m for metres, p95_m in sorted(by_horizon.items()) if len(p95_m) >= FEWEST_GROUNDS}
+    if not p95_by_horizon:
         return None
-    ends = np.array([ground_interval(np.array(p95_m), spread_std) for p95_m in known.values()])
-    reached = [within_budget(np.array(list(known)), ends[:, column], budget_m) for column in (1, 0)]
+    ends = np.array([ground_interval(np.array(p95_m), spread_std) for p95_m in p95_by_horizon.values()])
+    reached = [within_budget(np.array(list(p95_by_horizon)), ends[:, column], budget_m) for column in (1, 0)]
     low, high = (None if one is None or one[1] else one[0] for one in reached)
     return low, high

@@ -90,11 +90,11 @@ def _corrected(run: Run) -> LogConstants:
 
 def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
     """Return the antenna's position forward and right [m]; None where neither configuration nor log states it."""
-    used, given = run.sensors.facts.antenna_m, run.config.frames
-    in_log = run.sensors.facts.antenna_is_known and given.antenna_right_m == "auto"
+    used, frames = run.sensors.facts.antenna_m, run.config.frames
+    in_log = run.sensors.facts.antenna_is_known and frames.antenna_right_m == "auto"
     return (
-        used[0] if in_log or given.antenna_forward_m != "auto" else None,
-        used[1] if in_log or given.antenna_right_m != "auto" else None,
+        used[0] if in_log or frames.antenna_forward_m != "auto" else None,
+        used[1] if in_log or frames.antenna_right_m != "auto" else None,
     )
 
 
@@ -383,12 +383,12 @@ def calibrate_runs(
         if len(left_out) == 1:
             raise DataError(*left_out[0], "--allow-unusable takes a run that is not usable")
         raise DataError("runs", f"none of {len(left_out)} can be used", "; ".join(map(str, left_out)))
-    if len(found := {robot.wheel_radius_m for robot in robots}) > 1:
-        why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
+    if len(radii_m := {robot.wheel_radius_m for robot in robots}) > 1:
+        why = f"{' and '.join(sorted(map(str, radii_m)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
-    known = alone if len(taken) == 1 else tuple(dict.fromkeys(known for one in taken for known in one.notes))
+    notes = alone if len(taken) == 1 else tuple(dict.fromkeys(notes for one in taken for notes in one.notes))
     named = [one.ground for one in taken] if all(one.ground for one in taken) else []
-    return calibrate_recordings(recordings, robots[0], known, named)._replace(left_out=tuple(left_out))
+    return calibrate_recordings(recordings, robots[0], notes, named)._replace(left_out=tuple(left_out))
 
 
 class _Taken(NamedTuple):
@@ -460,14 +460,14 @@ def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
 
 def use_notes(run: Run, *, alone: bool = True) -> tuple[Note, ...]:
     """Return the notes for the user of a calibration from a run; `alone`: the calibration is from no other run."""
-    found: list[Note] = []
+    notes: list[Note] = []
     if alone:
-        found += [] if run.usable else [note("run_not_usable", f"not usable: {run.document.unusable_because}")]
-        found += run.document.excitation.notes
+        notes += [] if run.usable else [note("run_not_usable", f"not usable: {run.document.unusable_because}")]
+        notes += run.document.excitation.notes
     if are_twist(run.document.streams) and run.config.wheels.twist_width_m is None:
         why = (
             "the wheels were read from body twists, which hold the controller's own multipliers: "
             "these numbers are right only where b and radius are those the twists were made with"
         )
-        found.append(note("wheels_from_twist", why))
-    return tuple(found)
+        notes.append(note("wheels_from_twist", why))
+    return tuple(notes)

@@ -149,10 +149,10 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         if frame not in get_args(Frame):
             raise ValueError(f"frame {frame!r} is not known: ned or enu")
         left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
-        found = self.fitted.twist(wheel_motion(left, right, self.width_m))
+        twist = self.fitted.twist(wheel_motion(left, right, self.width_m))
         if frame == "enu":
-            found = found * np.array([[1.0], [-1.0], [-1.0]])
-        return found[:, 0] if np.ndim(v_left) == 0 else found
+            twist = twist * np.array([[1.0], [-1.0], [-1.0]])
+        return twist[:, 0] if np.ndim(v_left) == 0 else twist
 
     def odometry(self, log: RobotLog) -> Odometry:
         """Return the path that the wheels of a log make, from the origin with heading zero.
@@ -173,11 +173,11 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         A speed holds until the next sample; Euler steps, as in the dropout analysis. Angles and counts become metres
         with the numbers that the calibration was fitted with.
         """
-        known = RobotConfig(
+        robot = RobotConfig(
             wheel_radius_m=self.robot.wheel_radius_m,
             encoder_counts_per_rev=self.robot.encoder_counts_per_rev or None,
         )
-        wheels = with_wheel_speeds(log, Config(robot=known)).wheels
+        wheels = with_wheel_speeds(log, Config(robot=robot)).wheels
         v_x, v_y, omega = self.twist(wheels.v_left_mps, wheels.v_right_mps)
         held = np.diff(wheels.stamp_ns) / 1e9
         heading = np.concatenate([[0.0], np.cumsum(held * omega[:-1])])
@@ -245,8 +245,8 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
 
     def summary(self) -> dict[str, Any]:
         """Return what the calibration file holds, as plain data."""
-        found: dict[str, Any] = plain_value(msgspec.structs.replace(self, name=UNSET))
-        return found
+        content: dict[str, Any] = plain_value(msgspec.structs.replace(self, name=UNSET))
+        return content
 
 
 def stored_calibration(document: documents.CalibrationDocument) -> Calibration:
@@ -309,8 +309,10 @@ def parameter_documents(fitted: FittedModel) -> tuple[tuple[str, ...], dict[str,
     """Return terms, parameters and covariance of a model."""
     rows = zip(fitted.model.terms, fitted.parameters.tolist(), fitted.std.tolist(), strict=True)
     unseen = fitted.not_shown
-    found = {name: ParameterDocument(at, std, "not shown" if name in unseen else "shown") for name, at, std in rows}
-    return fitted.model.terms, found, fitted.covariance.tolist()
+    documents_by_term = {
+        name: ParameterDocument(at, std, "not shown" if name in unseen else "shown") for name, at, std in rows
+    }
+    return fitted.model.terms, documents_by_term, fitted.covariance.tolist()
 
 
 LARGEST_PARAMETER = 1e6
@@ -367,14 +369,14 @@ def unfit_reasons(calibration: Calibration) -> tuple[Note, ...]:
 
 def export_notes(calibration: Calibration) -> tuple[Note, ...]:
     """Return the notes that a user needs before a controller uses a calibration."""
-    found = [one for one in unfit_reasons(calibration) if one not in calibration.notes]
+    reasons = [one for one in unfit_reasons(calibration) if one not in calibration.notes]
     for name in calibration.fitted.not_shown:
         why = f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
-        found.append(note("parameter_not_shown", why))
+        reasons.append(note("parameter_not_shown", why))
     if (multiplier := calibration.controller.multiplier) < 1.0:
         why = "a skid-steer robot turns less than its wheels, not more"
-        found.append(note("multiplier_below_one", f"a multiplier of {multiplier:.2f} is below 1: {why}"))
-    return (*calibration.notes, *found)
+        reasons.append(note("multiplier_below_one", f"a multiplier of {multiplier:.2f} is below 1: {why}"))
+    return (*calibration.notes, *reasons)
 
 
 def factor_to_old(calibration: Calibration) -> float | None:

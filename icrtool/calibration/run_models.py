@@ -108,8 +108,8 @@ def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocumen
     if not hidden:
         return document
     words = f"{', '.join(hidden)} not shown: drive two full turns on the spot to each side"
-    known = [name for name in ICR_COLUMNS[:2] if document.icr_of_drive(name) is not None]
-    if known or document.controller is not None:
+    shown_icrs = [name for name in ICR_COLUMNS[:2] if document.icr_of_drive(name) is not None]
+    if shown_icrs or document.controller is not None:
         return msgspec.structs.replace(document, partly_because=words)
     grave = note("nothing_shown", words)
     return msgspec.structs.replace(

@@ -86,14 +86,14 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.Sensor
     DataError
         The drive is too short for an estimate.
     """
-    wheels, found = run.document.wheels, run.document.alignment
-    if not {kind.finding or key for key, kind in FINDING_KINDS.items()} <= found.keys():
+    wheels, findings = run.document.wheels, run.document.alignment
+    if not {kind.finding or key for key, kind in FINDING_KINDS.items()} <= findings.keys():
         metres = run.document.drive.distance_m
         why = f"{metres:.0f} m of driven distance are too few windows"
         raise DataError(run.name, why, "drive longer")
     driven, parameters = _drive(run), {}
     for key, kind in FINDING_KINDS.items():
-        value, std = _numbers(found[kind.finding or key])
+        value, std = _numbers(findings[kind.finding or key])
         verdict: documents.SensorVerdict = "not shown"
         if std <= WEAK * kind.useful:
             verdict = "shown" if std <= kind.useful else "weak"

@@ -164,14 +164,14 @@ def _sum_up(
     _, expected, p50, p95, _ = ranked.summary()
     blocks = statistics.cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
     sums = statistics.block_sums(errors_m, blocks, ranked, p50, p95)
-    found = statistics.error_intervals(errors_m, blocks, sums, p50, p95, FITTED_SPREAD)
-    numbers = (p95, found.p95_low, found.p95_high, expected, found.expected_low, found.expected_high)
+    intervals = statistics.error_intervals(errors_m, blocks, sums, p50, p95, FITTED_SPREAD)
+    numbers = (p95, intervals.p95_low, intervals.p95_high, expected, intervals.expected_low, intervals.expected_high)
     return documents.ErrorsAt(horizon_m, *map(finite_or_none, numbers)), sums
 
 
 def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[documents.ErrorsAt]:
     """Return the difference of errors at each horizon, second minus first; `paired`: over trials that both have."""
-    found = []
+    differences = []
     same = np.array_equal(first.path, second.path)
     for h, horizon in enumerate(TRANSFER_HORIZONS_M):
         sides = [one.errors[:, h] for one in (first, second)]
@@ -187,8 +187,8 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[docum
             more = math.nan if then is None or now is None else now - then
             half = statistics.difference_half_width(new, old, metric, 1.0, paired=paired)
             numbers += [finite_or_none(more), finite_or_none(more - half), finite_or_none(more + half)]
-        found.append(documents.ErrorsAt(horizon, *numbers))
-    return found
+        differences.append(documents.ErrorsAt(horizon, *numbers))
+    return differences
 
 
 def same_route(first: Track, second: Track) -> bool:

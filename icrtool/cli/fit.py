@@ -146,11 +146,11 @@ def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSo
 
     Exit status 1 when `icrtool fit` could not run on a log.
     """
-    config, given = settings.load(), options.options_to_repeat(settings, request)
+    config, options_given = settings.load(), options.options_to_repeat(settings, request)
     inputs = Inputs("log")
     for log in logs_of(logs, printer):
         with inputs.each(log) as document:
-            _examine(log, config, request, given, document, printer)
+            _examine(log, config, request, options_given, document, printer)
     printer.json("info", {"logs": inputs.documents})
     inputs.leave("logs")
 

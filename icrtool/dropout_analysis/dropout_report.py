@@ -475,7 +475,7 @@ def _counts(
         "across_slip_event": ("the path crosses a slip event", crossing),
     }
     for h, horizon_m in enumerate(errors.horizons_m.tolist()):
-        trials, starts = int(errors.counts.trials[h]), {key: int(found[h]) for key, (_, found) in reasons.items()}
+        trials, starts = int(errors.counts.trials[h]), {key: int(count[h]) for key, (_, count) in reasons.items()}
         why = ", ".join(f"{text} ({starts[key]:,} starts)" for key, (text, _) in reasons.items() if starts[key])
         if starts["too_little_way_left"] == errors.states:
             why = reasons["too_little_way_left"][0]

@@ -202,13 +202,20 @@ class BaselineReport:
         for one in self.document.models:
             for row in one.by_horizon:
                 if one.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6):
-                    found = next((sums for sums in one.blocks if sums.horizon_m == row.horizon_m), None)
-                    if found is None:
+                    sums_there = next((sums for sums in one.blocks if sums.horizon_m == row.horizon_m), None)
+                    if sums_there is None:
                         return row, None
-                    counts = (np.array(column, np.int64) for column in (found.trials, found.above_p50, found.above_p95))
+                    counts = (
+                        np.array(column, np.int64)
+                        for column in (sums_there.trials, sums_there.above_p50, sums_there.above_p95)
+                    )
                     trials, above_p50, above_p95 = counts
-                    growth = (float(documents.column_of([found], name)[0]) for name in ("p50_slope_m", "p95_slope_m"))
-                    return row, BlockSums(trials, np.array(found.errors_m, np.float64), above_p50, above_p95, *growth)
+                    growth = (
+                        float(documents.column_of([sums_there], name)[0]) for name in ("p50_slope_m", "p95_slope_m")
+                    )
+                    return row, BlockSums(
+                        trials, np.array(sums_there.errors_m, np.float64), above_p50, above_p95, *growth
+                    )
         return None, None
 
     def number_for(self, gate: Gate) -> tuple[float, BlockSums | None]:
@@ -236,15 +243,17 @@ class BaselineReport:
 
     def changes(self, run_document: RunDocument) -> tuple[str, ...]:
         """Return the differences in log, configuration and version, one sentence each."""
-        found = []
+        differences = []
         if not self.is_of(run_document):
-            found.append(f"another recording than in the baseline ({self.log}): the difference has a wider interval")
+            differences.append(
+                f"another recording than in the baseline ({self.log}): the difference has a wider interval"
+            )
         keys = sorted(_different_keys(self.document.run.config.effective(), run_document.config.effective()))
         if keys:
-            found.append(f"another configuration than in the baseline: {listed(keys, 5)}")
+            differences.append(f"another configuration than in the baseline: {listed(keys, 5)}")
         if self.tool_version != __version__:
-            found.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
-        return tuple(found)
+            differences.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
+        return tuple(differences)
 
     def is_of(self, run_document: RunDocument) -> bool:
         """Return whether the report was made of the same recording as a run."""
@@ -299,8 +308,8 @@ def pooled_baseline(drives: Sequence[documents.DropoutDocument], log: str, path:
     for model in first.models:
         rows = []
         for row in model.by_horizon:
-            found = {name: _numbers_of(drives, model.name, row.horizon_m, name) for name in _ERROR_COLUMNS}
-            means = {name: float(np.exp(np.log(_positive(one)).mean())) for name, one in found.items()
+            numbers = {name: _numbers_of(drives, model.name, row.horizon_m, name) for name in _ERROR_COLUMNS}
+            means = {name: float(np.exp(np.log(_positive(one)).mean())) for name, one in numbers.items()
                      if len(_positive(one))}  # fmt: skip
             rows.append(replace(row, **{name: means.get(name) for name in _ERROR_COLUMNS}))
         models.append(replace(model, by_horizon=rows, blocks=[]))
@@ -346,7 +355,7 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
     """
     if not (math.isfinite(budget_m) and budget_m > 0):
         raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
-    found = []
+    distances = []
     for result in report.results:
         reached = within_budget(report.horizons_m, result.column("p95_m"), budget_m)
         if reached is not None:
@@ -360,8 +369,8 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
             free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
             without = (None, False) if free is None else free[:2]
             ends_m = low, high, next_low, next_high
-            found.append(BudgetDistance(result.name, budget_m, *reached, *ends_m, *without))
-    return tuple(found)
+            distances.append(BudgetDistance(result.name, budget_m, *reached, *ends_m, *without))
+    return tuple(distances)
 
 
 def best_row(
@@ -477,8 +486,8 @@ def check_gate(
         A model or horizon that the report, or the baseline, does not have.
     """
     if (result := report.result(gate.model)) is None:
-        found = ", ".join(one.name for one in report.results)
-        advice = f"this run has {found}; no_slip needs robot.track_width_m"
+        choices = ", ".join(one.name for one in report.results)
+        advice = f"this run has {choices}; no_slip needs robot.track_width_m"
         raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
     sums = None
     if gate.budget_m is not None:
@@ -487,8 +496,8 @@ def check_gate(
     else:
         places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m or math.nan))
         if not len(places):
-            found = ", ".join(f"{horizon:g}" for horizon in report.horizons_m)
-            raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", f"use {found}")
+            choices = ", ".join(f"{horizon:g}" for horizon in report.horizons_m)
+            raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", f"use {choices}")
         h = int(places[0])
         value, sums = float(result.column(METRICS[gate.metric])[h]), result.block_sums[h]
     half_width, before = math.nan, math.nan

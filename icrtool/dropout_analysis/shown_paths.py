@@ -144,13 +144,13 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     straight = moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)]
     del chord  # a column of a long log is large
     off = np.abs(np.abs(change(track.heading)) - np.pi)
-    found = []
+    examples = []
     for group in (moving[off <= off.min() + ALIKE_RAD], straight):
         sample = group[:: -(-len(group) // TYPICAL_OF)]
         errors = [open_loop_errors(track, models[0].icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
         start = int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
-        found.append(_example(run, track, models, (), models[0].name, start, int(ends[start]), horizon_m))
-    return tuple(found)
+        examples.append(_example(run, track, models, (), models[0].name, start, int(ends[start]), horizon_m))
+    return tuple(examples)
 
 
 def _example(

@@ -260,8 +260,8 @@ def _check_warm_start(start: WarmStart) -> None:
     """Refuse ICRs and a covariance that cannot be the end of a run."""
     icrs, covariance = np.asarray(start.icrs_m, np.float64), np.asarray(start.covariance_m2, np.float64)
     if icrs.shape != (3,) or not (np.abs(icrs) <= FARTHEST_START_M).all():
-        found = ", ".join(f"{value:.4g}" for value in icrs.ravel()[:3])
-        raise ConfigError("warm start", f"its ICRs are {found} m", f"each lies within {FARTHEST_START_M:g} m")
+        values = ", ".join(f"{value:.4g}" for value in icrs.ravel()[:3])
+        raise ConfigError("warm start", f"its ICRs are {values} m", f"each lies within {FARTHEST_START_M:g} m")
     sound = covariance.shape == (3, 3) and bool((np.abs(covariance) <= LARGEST_START_STD_M**2).all())
     if not sound or np.linalg.eigvalsh(covariance).min() < -1e-9 * max(1.0, float(np.abs(covariance).max())):
         raise ConfigError("warm start", "its covariance matrix is not valid", "fit the log that it comes from again")
@@ -278,14 +278,16 @@ def initial_icrs(config: Config) -> IcrStart:
     settings, robot, half = config.filter, config.robot, width_or_usual_m(config.robot.track_width_m) / 2
     factor = None if robot.track_width_m is None else robot.skid_factor
     rules, usual = settings.rules, (USUAL_FACTOR if factor is None else factor) * half
-    given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
+    configured = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
     preset = rules.initial_icrs_m or (usual, -usual, 0.0)
-    right, left, x = (value if value is not None else default for value, default in zip(given, preset, strict=True))
+    right, left, x = (
+        value if value is not None else default for value, default in zip(configured, preset, strict=True)
+    )
     if rules.keeps_sides:
         right, left = max(right, half), min(left, -half)
     away = max(abs(right - half), abs(left + half), abs(x))
     std = settings.initial_icr_std_m
-    if std is None and rules.keeps_sides and factor is not None and given == (None, None, None):
+    if std is None and rules.keeps_sides and factor is not None and configured == (None, None, None):
         return IcrStart((right, left, x), (SKID_FACTOR_STD * half, SKID_FACTOR_STD * half, USUAL_FACTOR_STD * half))
     if std is None:
         std = rules.initial_icr_std_m or max(USUAL_FACTOR_STD * half, LEAST_START_STD_M, away)

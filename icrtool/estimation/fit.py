@@ -135,14 +135,14 @@ def _first_from(stamps: Ints, at: int) -> int:
 
 def _joined(jumps: list[ReferenceJump], near_ns: int) -> list[ReferenceJump]:
     """Return jumps, each joined to the one before where it begins at most `near_ns` after its end."""
-    found: list[ReferenceJump] = []
+    joined: list[ReferenceJump] = []
     for jump in sorted(jumps, key=attrgetter("begin_ns")):
-        if not found or jump.begin_ns > found[-1].end_ns + near_ns:
-            found.append(jump)
+        if not joined or jump.begin_ns > joined[-1].end_ns + near_ns:
+            joined.append(jump)
             continue
-        before = found[-1]
+        before = joined[-1]
         larger = max(before, jump, key=lambda one: (not one.undecided, one.size_m))
-        found[-1] = msgspec.structs.replace(
+        joined[-1] = msgspec.structs.replace(
             larger,
             begin_ns=before.begin_ns,
             end_ns=max(before.end_ns, jump.end_ns),
@@ -153,4 +153,4 @@ def _joined(jumps: list[ReferenceJump], near_ns: int) -> list[ReferenceJump]:
             moved_north_m=before.moved_north_m + jump.moved_north_m,
             moved_east_m=before.moved_east_m + jump.moved_east_m,
         )
-    return found
+    return joined

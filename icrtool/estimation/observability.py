@@ -279,15 +279,15 @@ def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[
     std_m : (3,) of the final ICRs, `icrtool.estimation.observability.final_covariance`
     least_icr_m : the filter keeps both y ICRs at least this far from the centre line; -inf: anywhere
     """
-    final, found = dict(zip(ICR_COLUMNS, table.icrs_at(-1), strict=True)), dict[str, str]()
+    final, reasons = dict(zip(ICR_COLUMNS, table.icrs_at(-1), strict=True)), dict[str, str]()
     width = max(final["y_icr_right_m"] - final["y_icr_left_m"], MIN_ICR_SEPARATION_M)
     for name, std in zip(ICR_COLUMNS, std_m, strict=True):
         side = -1.0 if name == "y_icr_left_m" else 1.0
         if name != "x_icr_m" and side * final[name] <= AT_LIMIT * least_icr_m:
-            found[name] = f"stopped at the limit of {side * least_icr_m:+z.2f} m that the filter keeps"
+            reasons[name] = f"stopped at the limit of {side * least_icr_m:+z.2f} m that the filter keeps"
         elif std > WEAK_SHARE * width:
-            found[name] = f"± {std:.2f} m, by how much stretches of the drive differ"
-    return found
+            reasons[name] = f"± {std:.2f} m, by how much stretches of the drive differ"
+    return reasons
 
 
 def _lacking(

@@ -171,9 +171,9 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
     distance = float(chords.sum())
     modelled, lasted = np.diff(table.distance_m[rows]), np.diff(table.t_s[rows])
     # in a gap of the wheel data the model stands still
-    known = LEAST_MODELLED * chords < modelled
-    stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=known)
-    even = np.divide(chords, lasted, out=np.zeros(len(chords)), where=~known & (lasted > 0))
+    is_modelled = LEAST_MODELLED * chords < modelled
+    stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=is_modelled)
+    even = np.divide(chords, lasted, out=np.zeros(len(chords)), where=~is_modelled & (lasted > 0))
     speed = np.divide(np.diff(table.distance_m), interval, out=np.zeros(len(interval)), where=interval > 0)
     speed *= np.repeat(stretched, np.diff(rows))
     speed += np.repeat(even, np.diff(rows))

@@ -162,15 +162,15 @@ def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str
     """
     right, left = findings.get("y_icr_right_m"), findings.get("y_icr_left_m")
     apart = []
-    for row, (word, found) in enumerate((("right", right), ("left", left))):
-        if found is None or found.value is None or found.std is None:
+    for row, (word, finding) in enumerate((("right", right), ("left", left))):
+        if finding is None or finding.value is None or finding.std is None:
             return ""
         final = float(table.icrs_at(-1)[row])
-        sigma = math.hypot(found.std, math.sqrt(max(float(covariance[row, row]), 0.0)))
+        sigma = math.hypot(finding.std, math.sqrt(max(float(covariance[row, row]), 0.0)))
         separation = abs(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
-        if abs(final - found.value) > max(CONTRADICTION_SIGMAS * sigma, CONTRADICTION_SHARE * separation):
+        if abs(final - finding.value) > max(CONTRADICTION_SIGMAS * sigma, CONTRADICTION_SHARE * separation):
             apart.append(
-                f"y {word} is {final:+z.2f} m by the filter and {found.value:+z.2f} ± {found.std:.2f} m by windows"
+                f"y {word} is {final:+z.2f} m by the filter and {finding.value:+z.2f} ± {finding.std:.2f} m by windows"
             )
     return f"wheels and reference contradict each other ({'; '.join(apart)}): clocks or slip" if apart else ""
 
@@ -183,17 +183,17 @@ def rejected_share(code: Bytes) -> float:
 
 def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[Note]:
     """Return findings about noise that was raised because wheels contradict the reference."""
-    configured, found = configured_noise(config), list[Note]()
+    configured, notes = configured_noise(config), list[Note]()
     if noise.position_mps != configured.position_mps:
         causes = "slip, clock offsets, repeated samples, fixes worse than they state"
         raised = f"position noise raised to {noise.position_mps:.1f} m/s; filter.process_position_mps sets it"
         why = f"the wheels contradict the position reference ({causes}): {raised}"
-        found.append(note("position_noise_raised", why, name))
+        notes.append(note("position_noise_raised", why, name))
     if noise.heading_degps != configured.heading_degps:
         causes = "repeated samples, clock offsets, slip"
         raised = f"heading noise raised to {noise.heading_degps:.0f} deg/s; filter.process_heading_degps sets it"
-        found.append(note("heading_noise_raised", f"the wheels contradict the heading ({causes}): {raised}", name))
-    return found
+        notes.append(note("heading_noise_raised", f"the wheels contradict the heading ({causes}): {raised}", name))
+    return notes
 
 
 def run_warnings(

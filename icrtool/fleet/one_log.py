@@ -108,8 +108,8 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
     path, folder = path_from_bytes(request.path), path_from_bytes(request.folder)
     asked, files = request.report, request.files
     calibrations = [_calibration_of(one) for one in request.calibrations]
-    with fit_into(Below(folder, request.known.run), path, request.config, asked.fit, files, watch) as found:
-        run, partial = found
+    with fit_into(Below(folder, request.known.run), path, request.config, asked.fit, files, watch) as run_and_directory:
+        run, partial = run_and_directory
         baseline = None
         if request.baseline:
             row = request.known

@@ -60,12 +60,12 @@ def rows_at_steps(progress: Floats, step: float) -> Ints:
 
 def rows_of_cells(progress: Floats, cells_of: Callable[[Floats], Floats]) -> Ints:
     """Return the first row of each cell, from 0 on, of values that never decrease; `cells_of` gets parts of them."""
-    found, last = [np.empty(0, np.int64)], -1.0
+    parts, last = [np.empty(0, np.int64)], -1.0
     for lo in range(0, len(progress), ROWS_AT_ONCE):
         cell = cells_of(progress[lo : lo + ROWS_AT_ONCE])
-        found.append(lo + np.flatnonzero(cell > np.append(last, cell[:-1])))
+        parts.append(lo + np.flatnonzero(cell > np.append(last, cell[:-1])))
         last = cell[-1]
-    return np.concatenate(found)
+    return np.concatenate(parts)
 
 
 def runs_of(marked: Bools) -> tuple[Ints, Ints]:

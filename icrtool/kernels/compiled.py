@@ -449,14 +449,14 @@ def _stamp() -> tuple[str, ...]:
 
 def cache_places() -> list[Path]:
     """Return where machine code may be kept: ``NUMBA_CACHE_DIR``, else a folder of the package, or the user's cache."""
-    if given := os.environ.get("NUMBA_CACHE_DIR"):
-        return [Path(given)]
-    found = [Path(__file__).parent / "__pycache__"]
+    if named_place := os.environ.get("NUMBA_CACHE_DIR"):
+        return [Path(named_place)]
+    places = [Path(__file__).parent / "__pycache__"]
     users = Path(os.environ.get("XDG_CACHE_HOME", ""))
     # a container's user may have no home
     with suppress(RuntimeError):
-        found.append((users if users.is_absolute() else Path("~/.cache").expanduser()) / "icrtool")
-    return found
+        places.append((users if users.is_absolute() else Path("~/.cache").expanduser()) / "icrtool")
+    return places
 
 
 def writable_place() -> Path | None:
@@ -509,6 +509,6 @@ def all_kernels() -> Iterator[Kernel]:
     """Import every module of kernels; yield each compiled function once."""
     package = importlib.import_module(__name__.rpartition(".")[0])
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-        for found in vars(importlib.import_module(module.name)).values():
-            if isinstance(found, Kernel) and found.py_func.__module__ == module.name:
-                yield found
+        for value in vars(importlib.import_module(module.name)).values():
+            if isinstance(value, Kernel) and value.py_func.__module__ == module.name:
+                yield value

@@ -469,11 +469,11 @@ def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[f
     With few trials the errors may fall with the distance. They are replaced by the nearest values that never fall
     (isotonic regression, Barlow et al. 1972: the largest over beginnings of the smallest mean over ends).
     """
-    known = np.isfinite(p95_m)
-    if not known.any():
+    is_known = np.isfinite(p95_m)
+    if not is_known.any():
         return None
-    distance = np.concatenate([[0.0], horizons_m[known]])
-    p95 = np.concatenate([[0.0], never_falling(p95_m[known])])
+    distance = np.concatenate([[0.0], horizons_m[is_known]])
+    p95 = np.concatenate([[0.0], never_falling(p95_m[is_known])])
     over = np.flatnonzero(p95 > budget_m)
     if not len(over):
         return float(distance[-1]), True, (float(distance[-1]), float(distance[-1]))
@@ -492,5 +492,5 @@ def never_falling(values: Floats) -> Floats:
     # the smallest mean of a stretch from each first value to each last one or further
     least = np.minimum.accumulate(means[:, ::-1], axis=1)[:, ::-1]
     least[length <= 0] = -np.inf
-    found: Floats = least.max(axis=0)
-    return found
+    highest: Floats = least.max(axis=0)
+    return highest

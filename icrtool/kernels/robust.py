@@ -298,9 +298,9 @@ def correlated_covariance(fit: Linearised, group: Ints) -> Floats:
     of_prior = np.einsum("ij,j,ij->i", inverse, np.diag(fit.prior), inverse)
     square = (series**2).sum(axis=0)
     data = np.diag(covariance)
-    known = data > 0.0
+    is_shown = data > 0.0
     grown = np.ones(len(data))
-    grown[known] = np.maximum(1.0, ((square * long_run_factor(series) + of_prior)[known] / data[known]))
+    grown[is_shown] = np.maximum(1.0, ((square * long_run_factor(series) + of_prior)[is_shown] / data[is_shown]))
     size = np.sqrt(grown)
     return np.asarray(covariance * np.outer(size, size), np.float64)
 

@@ -66,7 +66,7 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
     row = np.maximum(np.searchsorted(track.t, at, side="right") - 1, 0)
     held = track.held[row]
     part = np.divide(np.clip(at - track.t[row], 0.0, held), held, out=np.zeros(m), where=held > 0.0)
-    found = PathKnots(
+    knots = PathKnots(
         np.empty(m), np.empty(m), np.empty(m, np.complex128), np.empty(m, np.complex128),
         np.zeros((k, m)), np.empty((k, m), np.complex128),
     )  # fmt: skip
@@ -92,20 +92,20 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
         moved = lasting * velocity
         place = sums_from(place[-1], moved)
         moving = lasting[step] > 0.0
-        found.heading[here] = heading[step] + share * turned[step]
-        found.turn_rate[here] = np.where(moving, omega[step], 0.0)
-        found.place[here] = place[step] + share * moved[step]
-        found.velocity[here] = np.where(moving, velocity[step], 0.0)
+        knots.heading[here] = heading[step] + share * turned[step]
+        knots.turn_rate[here] = np.where(moving, omega[step], 0.0)
+        knots.place[here] = place[step] + share * moved[step]
+        knots.velocity[here] = np.where(moving, velocity[step], 0.0)
         by = lasting * columns
         turned_by = sums_from(heading_by, by[turning])
-        found.heading_by[turning, here] = turned_by[:, step] + share * by[turning][:, step]
+        knots.heading_by[turning, here] = turned_by[:, step] + share * by[turning][:, step]
         moved_by = by * forward
         moved_by[turning] = (turned_by[:, :-1] + ahead * columns[turning]) * moved
         sums = sums_from(place_by, moved_by)
         # a turn and a velocity to the right move it at right angles to what is summed here
-        found.place_by[:, here] = (sums[:, step] + share * moved_by[:, step]) * direction
+        knots.place_by[:, here] = (sums[:, step] + share * moved_by[:, step]) * direction
         heading_by, place_by = turned_by[:, -1], sums[:, -1]
-    return found
+    return knots
 
 
 def displacements(path: PathKnots, start: Ints, end: Ints) -> tuple[Complexes, Complexes]:

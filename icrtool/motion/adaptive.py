@@ -234,8 +234,8 @@ class Estimate:
 def _scale_of(residuals: Floats, kind: Ints) -> Floats:
     """Return the robust standard deviation (2,) of the residuals of each kind, pooled with `USUAL_STD`."""
     count = len(kind) / len(RESIDUAL_KINDS) / WINDOWS_AS_ONE
-    found = scale_by_kind(residuals, kind)[[0, -1]]
-    together = (count * found**2 + USUAL_COUNTS_AS * np.square(USUAL_STD)) / (count + USUAL_COUNTS_AS)
+    scales = scale_by_kind(residuals, kind)[[0, -1]]
+    together = (count * scales**2 + USUAL_COUNTS_AS * np.square(USUAL_STD)) / (count + USUAL_COUNTS_AS)
     return np.asarray(np.sqrt(together))
 
 
@@ -324,10 +324,10 @@ class AdaptiveModel:
         """
         if self._begin_s is None:
             self._begin_s = 0.0
-        found = self._take(samples)
+        rows_taken = self._take(samples)
         self.distance_m = self._drive.distance_m
         self._last = float(samples[0, -1]), float(samples[1, -1] + samples[2, -1]) / 2.0, float(samples[-1, -1])
-        return found
+        return rows_taken
 
     def twist(self, v_left: Floats | float, v_right: Floats | float, gyro_radps: Floats | float = 0.0) -> Floats:
         """Return the body twist v_x, v_y [m/s], omega [rad/s] of wheel speeds [m/s], (3,) or (3, n), as known now.
@@ -349,17 +349,17 @@ class AdaptiveModel:
 
     def _take(self, samples: Floats) -> list[Learned]:
         """Take samples, and solve at each knot where a solution is due."""
-        found = []
+        rows_taken = []
         for knot in range(self._drive.take(samples), self._drive.count):
             at_m, size = knot * self._drive.every_m, self._drive.size
             if at_m < self._next_m:
                 continue
             self._next_m = at_m + float(np.clip(SHARE_OF_DISTANCE * at_m, SHORTEST_M * size, LONGEST_M * size))
             if self._solve(knot, at_m):
-                found.append(self.now._replace(t_s=self._drive.time_of(knot), distance_m=at_m))
+                rows_taken.append(self.now._replace(t_s=self._drive.time_of(knot), distance_m=at_m))
         if self._drive.distance_m > REBUILT_TO_M * self._drive.size:
             self._drive.forget_until(self._used)
-        return found
+        return rows_taken
 
     def _solve(self, knot: int, at_m: float) -> bool:
         """Solve with the windows that have ended at a knot; return whether there were new ones."""

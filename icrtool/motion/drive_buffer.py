@@ -95,20 +95,20 @@ class DriveBuffer:
             segment = segment[1:]
         else:
             laid = np.diff(cell, prepend=-1.0)
-        known = (rows[SampleRow.KNOWN] > 0.0) & np.isfinite(
+        is_known = (rows[SampleRow.KNOWN] > 0.0) & np.isfinite(
             rows[[SampleRow.NORTH, SampleRow.EAST, SampleRow.HEADING]]
         ).all(axis=0)
-        heading = self._unwrapped(rows[SampleRow.HEADING, old:], known[old:])
+        heading = self._unwrapped(rows[SampleRow.HEADING, old:], is_known[old:])
         number, first = _step_of(rows, gap)
         # knots come first: they count the steps that were complete before these samples
         at = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
         row = old + at
-        pose = [np.where(known[row], one, 0.0) for one in (*rows[POSE_ROWS[:2]][:, row], heading[at])]
+        pose = [np.where(is_known[row], one, 0.0) for one in (*rows[POSE_ROWS[:2]][:, row], heading[at])]
         steps = self._steps_before + self._steps.shape[1] + number[row]
         self._knots = np.column_stack(
             [
                 self._knots,
-                [rows[SampleRow.T, row], *pose, segment[at], known[row], steps, self._samples + first[number[row]]],
+                [rows[SampleRow.T, row], *pose, segment[at], is_known[row], steps, self._samples + first[number[row]]],
             ]
         )
         self._close(rows, held, first)
@@ -158,14 +158,14 @@ class DriveBuffer:
         As `icrtool.kernels.track.cut`: no window crosses a gap, a jump or a slip event, or has an end without a pose.
         """
         knots, before = self._knots, self._knots_before
-        segment, known = knots[KNOT_SEGMENT], knots[KNOT_KNOWN] > 0.0
-        found = []
+        segment, is_known = knots[KNOT_SEGMENT], knots[KNOT_KNOWN] > 0.0
+        cut = []
         for length_m in LEARNT_WINDOWS_M:
             over = round(length_m / EVERY_M)
             end = np.arange(max(first - before, over), last - before + 1)
-            end = end[(segment[end] == segment[end - over]) & known[end] & known[end - over]]
-            found.append(np.stack([end - over, end, np.full(len(end), length_m * self.size)]))
-        begin, end, length = np.concatenate(found, axis=1)
+            end = end[(segment[end] == segment[end - over]) & is_known[end] & is_known[end - over]]
+            cut.append(np.stack([end - over, end, np.full(len(end), length_m * self.size)]))
+        begin, end, length = np.concatenate(cut, axis=1)
         if not len(begin):
             return None
         lo, hi = int(begin.min()), last - before + 1

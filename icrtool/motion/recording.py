@@ -472,8 +472,8 @@ def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tu
     count, sizes, done = GUESSED_TURNS, GUESSED_TURNS * TURN_NOISE_RAD / MEAN_TO_STD, 0
     lines = []
     for row in rows.tolist():
-        known = int(np.searchsorted(every[1:], row, side="right"))
-        for turn, time, truth in zip(*(column[done:known] for column in made), strict=True):
+        until = int(np.searchsorted(every[1:], row, side="right"))
+        for turn, time, truth in zip(*(column[done:until] for column in made), strict=True):
             spread = MEAN_TO_STD * sizes / count
             missed = truth - turn - scale * turn - bias * time
             std = math.hypot(spread, MISSED_TURN_SHARE * turn)
@@ -483,7 +483,7 @@ def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tu
             determinant = a * c - b * b
             scale, bias = (c * p - b * q) / determinant, (a * q - b * p) / determinant
             count, sizes = count + 1, sizes + min(abs(missed) / std, MOST_SIGMAS) * spread
-        done = known
+        done = until
         lines.append((1.0 + scale, bias))
-    found = np.array(lines)
-    return PastLines(rows, found[:, 0], found[:, 1])
+    columns = np.array(lines)
+    return PastLines(rows, columns[:, 0], columns[:, 1])

@@ -280,9 +280,9 @@ class PooledFit(FittedModel):
         if np.count_nonzero(clear) < FEWEST_RESIDUALS:
             return None
         if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
-            found = self.refit_without(i)
-            covariance = self._covariance(np.linalg.inv(found.curvature)[:k, :k])
-            fitted = replace(found.fitted, covariance=covariance)
+            refit = self.refit_without(i)
+            covariance = self._covariance(np.linalg.inv(refit.curvature)[:k, :k])
+            fitted = replace(refit.fitted, covariance=covariance)
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         of_wheels = None if self.wheels is None else self.wheels.without(fold)
         wheels = None if of_wheels is None else of_wheels[0]
@@ -400,12 +400,12 @@ def own_constants(
     ----------
     held : constants that keep their values; those that are NaN are estimated. Default: all are
     """
-    known = np.full(len(constant_std(fitted.model)), np.nan)
+    held_values = np.full(len(constant_std(fitted.model)), np.nan)
     if held is not None:
-        known = np.array(held)[: len(known)]
-    if not np.isnan(known).any():
-        return LogConstants(*known.tolist())
-    return LogConstants(*_fit_constants(windows, fitted, width_m, known, len(windows.begin) / 5.0)[0].tolist())
+        held_values = np.array(held)[: len(held_values)]
+    if not np.isnan(held_values).any():
+        return LogConstants(*held_values.tolist())
+    return LogConstants(*_fit_constants(windows, fitted, width_m, held_values, len(windows.begin) / 5.0)[0].tolist())
 
 
 def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) -> KnownConstants:
@@ -417,11 +417,11 @@ def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) ->
     part of the deviations: constants are used with the parameters that they were measured with.
     """
     pool = Pool([windows], [width_m])
-    known = np.full(len(constant_std(fitted.model)), np.nan)
-    found, fit = _fit_constants(windows, fitted, width_m, known, pool.overlap)
+    unknown = np.full(len(constant_std(fitted.model)), np.nan)
+    constants, fit = _fit_constants(windows, fitted, width_m, unknown, pool.overlap)
     std = np.sqrt(np.diag(student_covariance(fit, [pool.group])))
-    without = np.full(len(CONSTANT_STD) - len(known), np.nan)
-    return KnownConstants(*(LogConstants(*np.append(one, without).tolist()) for one in (found, std)))
+    without = np.full(len(CONSTANT_STD) - len(unknown), np.nan)
+    return KnownConstants(*(LogConstants(*np.append(one, without).tolist()) for one in (constants, std)))
 
 
 def _fit_constants(
@@ -523,10 +523,10 @@ class Pool:
                 residuals[self.rows(i)], jacobian[self.rows(i)] = of_recordings[i](x[:k], constants)
             return residuals, jacobian
 
-        found = robust_least_squares(
+        solution = robust_least_squares(
             evaluate, mean, mean, std, kind=self.kind, parts=Parts(self.first, own if count > 1 else 0),
             overlap=self.overlap, settled=LAST_DELAY_STEP_SIGMAS,
         )  # fmt: skip
         levels = [self.group, *([self.recording] if count > 1 else [])]
-        covariance = student_covariance(found, levels)[:k, :k]
-        return PooledFit(model, found.x[:k], covariance, wheels=wheels, pool=self, wide=wide, solution=found)
+        covariance = student_covariance(solution, levels)[:k, :k]
+        return PooledFit(model, solution.x[:k], covariance, wheels=wheels, pool=self, wide=wide, solution=solution)

@@ -171,8 +171,8 @@ class Run:
     @property
     def summary(self) -> dict[str, Any]:
         """What run.json holds, as plain data."""
-        found: dict[str, Any] = plain_value(self.document)
-        return found
+        content: dict[str, Any] = plain_value(self.document)
+        return content
 
     @property
     def notes(self) -> tuple[Note, ...]:

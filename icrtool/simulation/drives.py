@@ -265,11 +265,11 @@ def drive_plan(plan: DrivePlan, tail_s: float, rng: np.random.Generator | None =
     `rng` draws the ground of a robot on sliding contacts; default: seed 0.
     """
     end = plan.duration_s + tail_s + 2 * plan.step_s
-    given = plan.path.t_s if isinstance(plan.path, TrackSpeeds) else np.empty(0)
+    times_s = plan.path.t_s if isinstance(plan.path, TrackSpeeds) else np.empty(0)
     edges = np.array([time for time, _ in plan.changes])
     # A division, because k / 100 and j / 20 give the same double for the same time; products may differ.
     grid = np.arange(math.ceil(end / plan.step_s)) / round(1 / plan.step_s)
-    t = np.union1d(grid, np.concatenate([given[given < end], edges[edges < end]]))
+    t = np.union1d(grid, np.concatenate([times_s[times_s < end], edges[edges < end]]))
     command_t = t
     if plan.command_rate_hz is not None:
         command_t = np.floor(t * plan.command_rate_hz * (1 + 1e-12)) / plan.command_rate_hz
@@ -281,7 +281,7 @@ def drive_plan(plan: DrivePlan, tail_s: float, rng: np.random.Generator | None =
             rng=rng if rng is not None else np.random.default_rng(0),
         )  # fmt: skip
     if isinstance(plan.path, TrackSpeeds):
-        row = np.clip(np.searchsorted(given, command_t, side="right") - 1, 0, None)
+        row = np.clip(np.searchsorted(times_s, command_t, side="right") - 1, 0, None)
         left, right = plan.path.v_left_mps[row], plan.path.v_right_mps[row]
     else:
         left, right = track_speeds(*plan_body(plan.path, command_t, plan.icrs_m), plan.icrs_m)

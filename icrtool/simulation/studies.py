@@ -117,9 +117,9 @@ def on_circle(base: Scenario, radius: float) -> Scenario:
 
 def by_start(request: StudyRequest) -> Iterator[Setting]:
     """Vary the guard and, on a grid, both initial y ICRs."""
-    base, given = in_preset(request, request.presets[0]), request.config.filter.initial_x_icr_m
+    base, initial_x_m = in_preset(request, request.presets[0]), request.config.filter.initial_x_icr_m
     of_preset = base.config.filter.rules.initial_icrs_m or (0.0, 0.0, 0.0)
-    x = given if given is not None else of_preset[2]
+    x = initial_x_m if initial_x_m is not None else of_preset[2]
     for (name, guard), right, left in product(GUARDS.items(), request.values, request.values):
         order = "proper start" if right > left else "inverted start" if right < left else ""
         start = {"start_y_icr_right_m": right, "start_y_icr_left_m": left}

@@ -139,8 +139,8 @@ def run_scenarios(
 
     done = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for found in pool.map(work, jobs):
-            done.append(found)
+        for measured in pool.map(work, jobs):
+            done.append(measured)
             if progress is not None:
                 progress(len(done) / len(jobs))
     of_scenarios = (done[first : first + runs] for first in range(0, len(done), runs))
@@ -375,7 +375,7 @@ def measure_open_loop(run: StudyRun) -> Found:
     starts = np.flatnonzero(ends < len(distance))
     if len(starts):
         starts = starts[np.linspace(0, len(starts) - 1, TRIAL_STARTS).astype(np.int64)]
-    found: Found = {}
+    numbers: Found = {}
     for name, icrs in (("blind_icr_10m_p95_m", run.x[-1, 3:]), ("blind_no_slip_10m_p95_m", no_slip)):
         errors = []
         for first, last in zip(starts, ends[starts], strict=True):
@@ -383,8 +383,8 @@ def measure_open_loop(run: StudyRun) -> Found:
             t, v_left, v_right = truth.t_s[rows], truth.v_left_mps[rows], truth.v_right_mps[rows]
             end = drive(t, v_left, v_right, icrs[None, :], np.zeros(len(t), np.int64), truth.pose[first])[-1]
             errors.append(np.hypot(*(end - truth.pose[last])[:2]))
-        found[name] = float(np.percentile(errors or [np.nan], 95))
-    return found
+        numbers[name] = float(np.percentile(errors or [np.nan], 95))
+    return numbers
 
 
 def measure_consistency(run: StudyRun) -> Found:

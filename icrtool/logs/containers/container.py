@@ -274,10 +274,10 @@ class Container(ABC):
 
     def report(self, code: str, problem: str) -> None:
         """Remember what could not be read: each finding once, and at most `MOST_PROBLEMS` of them."""
-        found = note(code, shortened(escaped(problem), LONGEST_PROBLEM), self._name)
-        if found not in self._problems and len(self._problems) <= MOST_PROBLEMS:
+        finding = note(code, shortened(escaped(problem), LONGEST_PROBLEM), self._name)
+        if finding not in self._problems and len(self._problems) <= MOST_PROBLEMS:
             is_last = len(self._problems) == MOST_PROBLEMS
-            self._problems.append(note("log_more_problems", "and more of the kind", self._name) if is_last else found)
+            self._problems.append(note("log_more_problems", "and more of the kind", self._name) if is_last else finding)
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:
         """Return the files that make up this log, with their SHA-256: of their beginning once `ended` is set."""

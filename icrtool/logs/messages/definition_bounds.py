@@ -92,11 +92,11 @@ class FieldNames:
             As `add`.
         """
         within: list[str] = []
-        for found in _MODULE.finditer(idl):
-            if found[0] == "}":
+        for module in _MODULE.finditer(idl):
+            if module[0] == "}":
                 within = within[:-1]
             else:
-                within.append(found[1] or "")
+                within.append(module[1] or "")
                 self.add(*within)
 
 

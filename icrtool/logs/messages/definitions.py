@@ -74,8 +74,8 @@ def ros_definitions(channel: Channel) -> Definitions:
 
 def definition_note(channel: Channel) -> str:
     """Return in words why the log's own definition of a channel's type is not used; empty where it is, or none is."""
-    known = channel.message_type, channel.definition, channel.definition_format, channel.encoding
-    return _known_definitions(*known)[1] if channel.encoding in ("cdr", "ros1") else ""
+    described = channel.message_type, channel.definition, channel.definition_format, channel.encoding
+    return _known_definitions(*described)[1] if channel.encoding in ("cdr", "ros1") else ""
 
 
 @lru_cache(maxsize=256)

@@ -522,8 +522,8 @@ def longest_part(log: RobotLog) -> RobotLog:
         if longest_s > PAUSE_S:
             why = "the recording was paused, or its clock was set forward"
             paused.append(note("recording_paused", f"{role}: no samples for {longest_s:.0f} s: {why}"))
-    found = paused[:1]
+    notes = paused[:1]
     if lost:
         why = f"more than a day apart from the other samples, and left out: {', '.join(lost)}; if the clock was set, "
-        found.insert(0, note("samples_days_apart", f"{why}--from and --to read that part"))
-    return replace(log, notes=(*log.notes, *notes_about(log.name, found)), **parts)
+        notes.insert(0, note("samples_days_apart", f"{why}--from and --to read that part"))
+    return replace(log, notes=(*log.notes, *notes_about(log.name, notes)), **parts)

@@ -60,8 +60,8 @@ def of_wheels(
             means[quantity], stuck = _side_means([*map(unwound_turns, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
     why = f"{listed([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
-    found = (note("wheel_dead", why),) if dead else ()
-    return motion_of(position=means["position"], speed=means["speed"], unit=unit, notes=found, **others)
+    notes = (note("wheel_dead", why),) if dead else ()
+    return motion_of(position=means["position"], speed=means["speed"], unit=unit, notes=notes, **others)
 
 
 def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set[int]]:

@@ -186,7 +186,7 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | Non
     of_models = (
         (one, [h for h in asked if len(one.histograms[h].left)]) for one in (*_models(report), *report.results)
     )
-    model, places = next(found for found in of_models if found[1])
+    model, places = next(drawn for drawn in of_models if drawn[1])
     budgets_m = dict.fromkeys(one.budget_m for one in report.document.budgets)
     errors = ", ".join(error_text(model.document.by_horizon[h].p95_m).removesuffix(" m") for h in places)
     distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
