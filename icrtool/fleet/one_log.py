@@ -140,7 +140,7 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
         multiplier=None if controller is None else controller.multiplier,
         multiplier_std=None if controller is None else controller.multiplier_std,
         errors=_errors(report.document.models)
-        | {name: plain(one.distance_m) for name, one in within}
+        | {name: plain_value(one.distance_m) for name, one in within}
         | {next_low_name(one.model, one.budget_m): one.to_plan_with_m for _, one in within},
         bounds=tuple(name for name, one in within if one.beyond),
         events=len(summary.events),

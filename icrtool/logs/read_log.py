@@ -70,8 +70,8 @@ def survey_log(
     """
     config = config if config is not None else Config()
     path = place_of(path)
-    begin, stop = moment(start, "start"), moment(end, "end")
-    before = states_of(path)
+    begin, stop = read_moment(start, "start"), read_moment(end, "end")
+    states_before = states_of(path)
     ended = Event()
     with contextlib.closing(open_log(path, progress)) as container, ThreadPoolExecutor(1) as pool:
         try:
@@ -82,7 +82,7 @@ def survey_log(
             candidates = find_candidates(tables, config, unread)
             inputs.result()
         except BaseException:
-            # The pool waits for its threads before it passes on Ctrl-C or an error.
+            # The pool waits for its threads states_before it passes on Ctrl-C or an error.
             ended.set()
             raise
         channels, transfer = tuple(container.channels), container.transfer()

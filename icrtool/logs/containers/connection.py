@@ -68,8 +68,8 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
     try:
         # `url_to_fs` of fsspec would follow chains with ::, also behind a question mark
         address = path.scheme + path.url[len(path.scheme) :]
-        settings = asked(path, lambda: {**kind._get_kwargs_from_urls(address), **_patience(path.scheme)})  # noqa: SLF001 - as it does
-        found: tuple[Any, str] = asked(path, lambda: (kind(**settings), kind._strip_protocol(address)))  # noqa: SLF001
+        settings = ask_server(path, lambda: {**kind._get_kwargs_from_urls(address), **_patience(path.scheme)})  # noqa: SLF001 - as it does
+        found: tuple[Any, str] = ask_server(path, lambda: (kind(**settings), kind._strip_protocol(address)))  # noqa: SLF001
     except (KeyError, IndexError, TypeError, AttributeError, NotImplementedError) as err:
         raise LogError(path, "is no address that can be read", type(err).__name__) from None
     return found
@@ -98,10 +98,10 @@ def _short_pages() -> type[Any]:
     class ShortPage(ClientResponse):
         async def read(self) -> bytes:
             if self._body is None:
-                body, began_s = bytearray(), time.monotonic()
+                body, began_s, quiet_s = bytearray(), time.monotonic(), server_timeout_s()
                 while piece := await self.content.read(_READ_BYTES):
                     body += piece
-                    check_pace(began_s, len(body))
+                    check_pace(began_s, len(body), quiet_s)
                     if len(body) > LARGEST_LISTING_BYTES:
                         raise ValueError(f"its server sends a list of more than {LARGEST_LISTING_BYTES:,} bytes")
                 self._body = bytes(body)
@@ -158,13 +158,13 @@ def in_time(files: Any, method: str, *given: object, expected_bytes: int = 0, **
     return sync(files.loop, getattr(files, f"_{method}"), *given, timeout=seconds, **named)
 
 
-def check_pace(began_s: float, received: int) -> None:
-    """Refuse a server that sent fewer bytes than `SLOWEST_BPS` asks for, since a time of `time.monotonic`."""
-    if time.monotonic() - began_s > server_timeout_s() + received / SLOWEST_BPS:
+def check_pace(began_s: float, received: int, quiet_s: float) -> None:
+    """Refuse a server that sent too few bytes since a time of `time.monotonic`; for `quiet_s` it may send nothing."""
+    if time.monotonic() - began_s > quiet_s + received / SLOWEST_BPS:
         raise TimeoutError
 
 
-def asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done: str = "read") -> Result:
+def ask_server(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done: str = "read") -> Result:
     """Return the answer to a request, made again where the connection broke.
 
     Parameters

@@ -24,12 +24,12 @@ from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.connection import (
     LARGEST_LISTING_BYTES,
     SLOWEST_BPS,
-    asked,
+    ask_server,
     check_pace,
     filesystem,
     in_time,
 )
-from icrtool.logs.containers.container import ahead
+from icrtool.logs.containers.container import work_ahead
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, natural_order, unpacked_name
 from icrtool.records.input_limits import most_bytes, server_timeout_s
 from icrtool.records.places import LARGEST_DOCUMENT_BYTES, UrlPath, place_of, without_secrets
@@ -165,8 +165,8 @@ class RemoteFile:
                 pieces, missing = [], end - begin
                 while missing and (piece := await answer.content.read(missing)):
                     pieces.append(piece)
-                    left -= len(piece)
-                    check_pace(began_s, end - begin - left)
+                    missing -= len(piece)
+                    check_pace(began_s, end - begin - missing, quiet_s)
                 return b"".join(pieces)
 
         async def all_of_them() -> list[bytes]:
@@ -269,7 +269,7 @@ class RemoteFile:
             with ask_server(self.path, lambda: self._files.open(self._name, block_size=0, **options)) as stream:
                 while piece := ask_server(self.path, lambda: stream.read(_FETCHED_BYTES), again=False):
                     received += len(piece)
-                    asked(self.path, partial(check_pace, began_s, received), again=False)
+                    ask_server(self.path, partial(check_pace, began_s, received, quiet_s), again=False)
                     yield piece
             return
         places = range(0, self.size, _FETCHED_BYTES)
@@ -328,7 +328,7 @@ def _about(path: UrlPath) -> dict[str, Any]:
     """Return what a store states about a file now, whatever it stated before."""
     files, name = filesystem(path)
     files.invalidate_cache(name)
-    about: dict[str, Any] = asked(path, lambda: in_time(files, "info", name))
+    about: dict[str, Any] = ask_server(path, lambda: in_time(files, "info", name))
     return about
 
 
@@ -387,8 +387,8 @@ def find_logs_at(path: UrlPath) -> list[UrlPath]:
     files, name = filesystem(path)
     # folders in folders without an end are no reason to go on for ever
     most = LARGEST_LISTING_BYTES if path.scheme.startswith("http") else LARGEST_DOCUMENT_BYTES
-    matched: dict[str, Any] = asked(path, lambda: in_time(files, "glob", name, detail=True, expected_bytes=most))
-    found = []
+    matched: dict[str, Any] = ask_server(path, lambda: in_time(files, "glob", name, detail=True, expected_bytes=most))
+    logs = []
     for inner, about in matched.items():
         one = _address(files, inner, path)
         logs += _below(one) if about.get("type") == "directory" else [one]
@@ -400,7 +400,7 @@ def find_logs_at(path: UrlPath) -> list[UrlPath]:
 def _is_there(path: UrlPath) -> bool:
     """Return whether there is a file of this very name, which may have brackets."""
     files, name = filesystem(path)
-    return bool(asked(path, lambda: in_time(files, "exists", name)))
+    return bool(ask_server(path, lambda: in_time(files, "exists", name)))
 
 
 def _below(folder: UrlPath) -> list[UrlPath]:

@@ -74,7 +74,7 @@ def forecast_figure(
         grown.axvspan(measured_m, total_m, label=f"beyond {measured_m:g} m: not measured", **BEYOND_LOOK)
     grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, total_m), ylim=(0.0, None))
     if reached is not None and not reached[1]:
-        grown.plot([reached[0]], [budgets_m[0]], zorder=5, **style.spot("black", 4.5))
+        grown.plot([reached[0]], [budgets_m[0]], zorder=5, **style.spot_look("black", 4.5))
         look: style.Look = {"ha": "right", "va": "bottom", "fontsize": 8.5}
         style.write_near(grown, f"{reached[0]:.1f} m", (reached[0], budgets_m[0]), (-3.0, 4.0), **look)
     path.plot(forecast.east_m, forecast.north_m, label="path", **style.HALF_WIDTH | {"linestyle": "-"})
@@ -99,10 +99,10 @@ def _draw_error_circles(axes: Axes, forecast: Forecast, last_m: float) -> None:
         axes.add_patch(Circle(place, radius, facecolor=blue, alpha=0.13, linewidth=0, zorder=1.5))
         axes.add_patch(Circle(place, radius, fill=False, edgecolor=blue, linewidth=1.0, zorder=2.5))
     axes.plot([], [], label="95 % of the errors by wheels", color=blue, linewidth=1.0)
-    begin: style.Look = style.spot("white") | {"label": "start", "zorder": 4}
+    begin: style.Look = style.spot_look("white") | {"label": "start", "zorder": 4}
     axes.plot([forecast.east_m[0]], [forecast.north_m[0]], **begin)
     if at:
-        axes.plot(*zip(*at, strict=True), zorder=4, **style.spot("black", 3.0))
+        axes.plot(*zip(*at, strict=True), zorder=4, **style.spot_look("black", 3.0))
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
     labels = [
@@ -416,7 +416,7 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
     title = f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}"
     known = ", with its 95 % interval" if fleet.intervals_m else ""
     subtitle = f"{fleet.title}: 95 % error after 10 m without GNSS{known}, {fleet.model}{cut}"
-    height_in = 1.85 + ROW_IN * len(shown)
+    height_in = 1.85 + ROW_IN * len(robots)
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=(3.1, 0.7, 0.65, 1.0))
     axes = sheet.subplots()[0, 0]
     axes.set_yticks(range(len(labels)), labels, parse_math=False)
@@ -425,12 +425,12 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
         rows = [row for row, one in enumerate(robots) if one[0] == group]
         middle = error_text(float(np.median(list(logs.values()))))
         label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
-        axes.plot([shown[row][2] for row in rows], rows, markersize=5.5, label=label, zorder=3, **look)
+        axes.plot([robots[row][2] for row in rows], rows, markersize=5.5, label=label, zorder=3, **look)
         for row in rows:
-            if (ends := fleet.intervals_m.get(shown[row][1])) is not None:
+            if (ends := fleet.intervals_m.get(robots[row][1])) is not None:
                 axes.plot(ends, [row, row], color=look["color"], linewidth=1.4, marker="|", markersize=6.0)
     centred: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False}
-    for row, (_, log, error) in enumerate(shown):
+    for row, (_, log, error) in enumerate(robots):
         last = fleet.intervals_m.get(log, (error, error))[1]
         style.write_near(axes, error_text(error), (last, row), (6.0, 0.0), **centred)
     style.logarithmic_errors(axes)

@@ -276,15 +276,15 @@ def atomic_directory(directory: Place, kind: Kind) -> Iterator[Path]:
 
 @contextmanager
 def partial_at(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
-    """Make a file or directory under a hidden name in the folder of a place, and remove this name at the end.
+    """Make a file or directory under a hidden name in the folder of a place, and remove_path this name at the end.
 
-    Hidden files that killed processes left there are removed too.
+    Hidden files that killed processes abandoned there are removed too.
     """
     for abandoned in list(place.parent.glob(_hidden_name(place, "*-*-*"))):
         # An old directory under a hidden name is kept as long as nothing is in its place.
         with suppress(FileNotFoundError):
-            if _is_left(left) and (left.suffix == PARTIAL_SUFFIX or place.exists()):
-                remove(left)
+            if _is_left(abandoned) and (abandoned.suffix == PARTIAL_SUFFIX or place.exists()):
+                remove_path(abandoned)
     partial = place.with_name(_hidden_name(place, writer(), PARTIAL_SUFFIX))
     with unfinished(partial):
         try:

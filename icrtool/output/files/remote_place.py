@@ -17,7 +17,7 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, NoReturn, TypeVar
 
 from icrtool.errors import IcrToolError, LogError, OutputError
-from icrtool.logs.containers.connection import asked, filesystem
+from icrtool.logs.containers.connection import ask_server, filesystem
 from icrtool.logs.containers.source import version_of
 from icrtool.logs.containers.unpack import ScratchFolder
 from icrtool.output.files.atomic import ABANDONED_S, has_process, make_folders, place_errors, write_file, writer

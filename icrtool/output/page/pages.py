@@ -470,18 +470,18 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
         ]
         by_group.append({"horizons_m": horizons, "models": models, "reference": {"p95": [], "expected": []}})
     # the chart begins with the group in whose runs a foreign calibration costs most
-    costs = [one for one in found.costs if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None]
-    dearest = max(costs or found.costs, key=lambda one: one.p95_m or 0.0, default=None)
-    verdict = comparison_title(found)
-    sections = [one for one in transfer_blocks(found) if len(found.pairs) > 1 or not isinstance(one, str)]
-    sections = [_comparison_answer(found, one) if isinstance(one, Section) and one.name == "verdict" else one
+    costs = [one for one in comparison.costs if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None]
+    dearest = max(costs or comparison.costs, key=lambda one: one.p95_m or 0.0, default=None)
+    verdict = comparison_title(comparison)
+    sections = [one for one in transfer_blocks(comparison) if len(comparison.pairs) > 1 or not isinstance(one, str)]
+    sections = [_comparison_answer(comparison, one) if isinstance(one, Section) and one.name == "verdict" else one
                 for one in sections]  # fmt: skip
     return render(
         (*VENDOR, "columns.js", "charts.js", "comparison.js"), {"by_group": by_group}, title=title,
         kind=f"Drive without GNSS: groups of runs compared ({title})",
-        blocks=[verdict._replace(about=f"Groups: {groups}."), *sections], drawn=group_sketch(found), groups=names,
+        blocks=[verdict._replace(about=f"Groups: {groups}."), *sections], drawn=group_sketch(comparison), groups=names,
         opened="" if dearest is None else dearest.tested_on, folded_models=0,
-        pictures=drawn_pictures([("transfer", transfer(found))]),
+        pictures=drawn_pictures([("transfer", transfer(comparison))]),
     )  # fmt: skip
 
 

@@ -76,18 +76,19 @@ def _held_out_distance(reached: BudgetDistance) -> tuple[str, str, str]:
     return name, distance, note
 
 
-def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
+def calibration_file_blocks(calibration: Calibration, title: str) -> list[Block]:
     """Return what the page of a calibration file states: numbers, errors on other distance, parameters, logs."""
-    icrs = [(found.geometry[name], found.geometry_std[name]) for name in ICR_COLUMNS]
-    driven = distance_text(sum(log.distance_m for log in found.logs))
-    about = f"{found.robot.name or 'robot'}: {counted(len(found.logs), 'log')}, {driven}, {model_text(found.fitted)}"
-    day = found.created[:10] if found.created else "at an unknown time"
-    made = f"Made {day} with icrtool {found.tool_version or 'unknown'}."
+    icrs = [(calibration.geometry[name], calibration.geometry_std[name]) for name in ICR_COLUMNS]
+    driven = distance_text(sum(log.distance_m for log in calibration.logs))
+    robot, model = calibration.robot.name or "robot", model_text(calibration.fitted)
+    about = f"{robot}: {counted(len(calibration.logs), 'log')}, {driven}, {model}"
+    day = calibration.created[:10] if calibration.created else "at an unknown time"
+    made_with = f"Made {day} with icrtool {calibration.tool_version or 'unknown'}."
     configuration: list[Block] = []
     with suppress(DataError):
-        configuration = configuration_blocks(found, "CAL.json")
-    unknown = "; ".join(TERMS[name].meaning for name in found.fitted.not_shown)
-    table = parameter_table(found.fitted, found.fitted_with_gyro)
+        configuration = configuration_blocks(calibration, "CAL.json")
+    unknown = "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown)
+    table = parameter_table(calibration.fitted, calibration.fitted_with_gyro)
     # a reader knows the meaning, a file has the term
     named = [
         (f"{WITH_GYRO}{meaning}" if term.startswith(WITH_GYRO) else meaning, *middle, term.removeprefix(WITH_GYRO))
@@ -107,11 +108,13 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
     ]
     return [
         Line(f"Not fit for use: {'; '.join(unfit)}" if unfit else "", "bad"),
-        Title(title, f"{about}.", made),
-        Section("Answer", _calibration_cards(found, icrs), name="answer"),
+        Title(title, f"{about}.", made_with),
+        Section("Answer", _calibration_cards(calibration, icrs), name="answer"),
         Section("Configuration to copy", configuration, name="controller"),
         Section(
-            "Errors of each log that was not fitted", [_held_out_table(found), _left_out_table(found)], name="held-out"
+            "Errors of each log that was not fitted",
+            [_held_out_table(calibration), _left_out_table(calibration)],
+            name="held-out",
         ),
         Section("Parameters of the motion model", parameters, name="parameters"),
         Section("Logs", [Table("lr", logs, head)], name="logs"),
@@ -183,7 +186,7 @@ def _held_out_table(found: Calibration) -> Table:
     return Table("lr", rows, ("row", *(f"{horizon:g} m" for horizon in horizons)), caption)
 
 
-def _left_out_table(found: Calibration) -> Table:
+def _left_out_table(calibration: Calibration) -> Table:
     """Return p95 and expected error by horizon of each log or block, predicted by a fit without it."""
     horizons = sorted({one.horizon_m for one in calibration.held_out_pooled})
     each = {(one.log, one.horizon_m): one for one in calibration.held_out if one.model == MAIN_ROW}

@@ -22,7 +22,7 @@ from icrtool.cli.inputs import named_place
 from icrtool.errors import ConfigError, IcrToolError, LogError
 from icrtool.logs.containers.connection import check_redirect, filesystem
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.source import SavedBytes, find
+from icrtool.logs.containers.source import SavedBytes, find_logs_at
 from icrtool.records.input_limits import MOST_BYTES, SERVER_TIMEOUT_S, most_bytes, server_timeout_s
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.samples import InputFile
