@@ -25,7 +25,7 @@ from icrtool.alignment.sensor_noise import (
 )
 from icrtool.alignment.slip_events import find_disagreements
 from icrtool.alignment.sparse_reference import without_interpolated
-from icrtool.alignment.wheel_alignment import bridged
+from icrtool.alignment.wheel_alignment import bridge_gaps
 from icrtool.alignment.wheel_units import with_right_size, with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
@@ -74,11 +74,12 @@ def align(log: RobotLog, config: Config) -> Measurements:
             spans = tuple((event.begin_ns, event.end_ns) for event in disagreements.events)
             measurements = _align_once(replace(log, slipping_ns=spans), config)
             disagreements = find_disagreements(measurements.sensors, width)
-    filled, bridge = bridged(measurements.sensors.wheels, config.filter.wheel_gap_s, measurements.sensors.fixes)
-    notes = about(log.name, [*shifts.notes, *([] if bridge is None else [bridge])])
-    sensors = replace(found.sensors, wheels=filled, events=seen.events, jumps=seen.jumps)
-    found = _with_size(replace(found, findings=with_shifts(with_shifts(found.findings, given), shifts)), size)
-    return replace(found, sensors=sensors, notes=(*found.notes, *notes))
+    filled, bridge = bridge_gaps(measurements.sensors.wheels, config.filter.wheel_gap_s, measurements.sensors.fixes)
+    notes = notes_about(log.name, [*shifts.notes, *([] if bridge is None else [bridge])])
+    sensors = replace(measurements.sensors, wheels=filled, events=disagreements.events, jumps=disagreements.jumps)
+    findings = with_shifts(with_shifts(measurements.findings, configured_shifts), shifts)
+    measurements = _with_size(replace(measurements, findings=findings), size)
+    return replace(measurements, sensors=sensors, notes=(*measurements.notes, *notes))
 
 
 def _with_size(found: Measurements, factor: float) -> Measurements:

@@ -82,7 +82,7 @@ def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Con
     heading = gnss if log.heading_is_of_position else heading
     if gnss == heading == 0.0:
         return log, config, NO_SHIFTS
-    inner = replace(config, frames=replace(frames, **cast("dict[str, Any]", dict.fromkeys(given, 0.0))))
+    inner = replace(config, frames=replace(frames, **cast("dict[str, Any]", dict.fromkeys(delays_s, 0.0))))
     return _moved(log, config, gnss, heading), inner, Shifts(gnss, heading, ())
 
 
@@ -141,8 +141,8 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
         notes += [note("clock_shifted", _sentence("gyro", shift, "gyro_delay_s")) for shift in of_gyros.values()]
         log = _with_gyros_moved(log, of_gyros) if of_gyros else log
     if not any(shifts.values()):
-        return log, config, given._replace(notes=tuple(notes))
-    total = Shifts(given.gnss + shifts["gnss"], given.heading + shifts["heading"], tuple(notes))
+        return log, config, configured._replace(notes=tuple(notes))
+    total = Shifts(configured.gnss + shifts["gnss"], configured.heading + shifts["heading"], tuple(notes))
     return _moved(log, config, shifts["gnss"], shifts["heading"]), config, total
 
 

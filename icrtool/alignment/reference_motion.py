@@ -230,7 +230,7 @@ def compare_by_duration(knots: Knots, motion: Motion) -> list[tuple[float, Compa
         first = np.flatnonzero(last < len(knots.t))
         last = last[first]
         usable = (last - first >= FEWEST_INTERVALS) & (knots.holes[first] == knots.holes[last])
-        by_duration.append((duration_s, compare_windows(knots, motion, first[usable], last[usable], RESPONSE_S)))
+        by_duration.append((duration_s, compare_with_wheels(knots, motion, first[usable], last[usable], RESPONSE_S)))
     return by_duration
 
 
@@ -257,7 +257,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     return Motion(place, turn, abs(fit.estimate("scale")[0]), width_m / 2 / gain)
 
 
-def compare_windows(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: float) -> ComparedWindows:
+def compare_with_wheels(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: float) -> ComparedWindows:
     """Compare reference and wheels between rows of the knots (w,).
 
     Parameters
@@ -363,7 +363,7 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     motion : that the wheels make
     """
     last = first + 1
-    windows = compare_windows(knots, motion, first, last, 0.0)
+    windows = compare_with_wheels(knots, motion, first, last, 0.0)
     duration = knots.t[last] - knots.t[first]
     speed = np.diff(knots.track.distance) / np.diff(knots.t)
     # largest speed of the wheels, without single samples

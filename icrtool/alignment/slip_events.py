@@ -26,7 +26,7 @@ from icrtool.alignment.reference_motion import (
     Knots,
     Motion,
     compare_by_duration,
-    compare_windows,
+    compare_with_wheels,
     decide_jumps,
     fit_motion,
     lay_knots,
@@ -153,7 +153,7 @@ def _find_events(
     row, outside = np.arange(len(knots.t)), np.ones(len(knots.t), np.bool_)
     if not len(windows.begin):
         return [], outside
-    steps = compare_windows(knots, motion, row[:-1], row[1:], RESPONSE_S)
+    steps = compare_with_wheels(knots, motion, row[:-1], row[1:], RESPONSE_S)
     whole = knots.holes[1:] == knots.holes[:-1]
     free, events = whole.copy(), list[SlipEvent]()
     tests = max(1.0, float(knots.t[-1] - knots.t[0]) / WINDOWS_S[0])

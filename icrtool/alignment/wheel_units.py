@@ -26,7 +26,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.robust import mad_std
-from icrtool.records.notes import Note, about, note
+from icrtool.records.notes import Note, note, notes_about
 from icrtool.records.run import ROLLING_SCALE
 from icrtool.records.samples import NO_HEADINGS, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
@@ -156,7 +156,7 @@ def with_right_size(log: RobotLog, config: Config) -> tuple[RobotLog, float]:
         f"the robot goes {_with_std(Scale(100.0 * factor, 100.0 * scale.std))} % of the distance that the wheels report"
     )
     check = f"corrected; {radius_hint(log, config, factor)}wheel radius, encoder resolution, gear and units"
-    found = about(log.name, [note("wheel_size_wrong", f"{text}: {check}")])
+    found = notes_about(log.name, [note("wheel_size_wrong", f"{text}: {check}")])
     return replace(log, wheels=size, notes=(*log.notes, *found)), factor
 
 

@@ -78,7 +78,7 @@ def by_preset(
     return vary
 
 
-def with_sensors(base: Scenario, **sensors: Any) -> Scenario:
+def with_other_sensors(base: Scenario, **sensors: Any) -> Scenario:
     """Return a scenario with other sensors."""
     return replace(base, sensors=replace(base.sensors, **sensors))
 
@@ -91,7 +91,7 @@ def with_path(base: Scenario, **path: Any) -> Scenario:
 def at_rate(base: Scenario, rate: float) -> Scenario:
     """Return a scenario with another rate of wheels and heading; a higher rate of the fixes is reduced to it."""
     gnss_rate = min(rate, base.sensors.gnss_rate_hz)
-    return with_sensors(base, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
+    return with_other_sensors(base, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
 
 
 def from_source(base: Scenario, name: str) -> Scenario:
@@ -100,8 +100,8 @@ def from_source(base: Scenario, name: str) -> Scenario:
     The bias is the difference of command and track speed. The drives of both scenarios are the same.
     """
     if name == "encoder":
-        return with_sensors(base, wheels="encoder", input_bias_mps=0.0)
-    return with_sensors(base, wheels="commanded", wheel_rate_hz=base.plan.command_rate_hz)
+        return with_other_sensors(base, wheels="encoder", input_bias_mps=0.0)
+    return with_other_sensors(base, wheels="commanded", wheel_rate_hz=base.plan.command_rate_hz)
 
 
 def on_circle(base: Scenario, radius: float) -> Scenario:
@@ -207,7 +207,7 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
         runs=20,
         values=STUDY_NOISES,
         plan=WINDING,
-        vary=by_preset(lambda base, value: with_sensors(base, **{sensors_field: value})),
+        vary=by_preset(lambda base, value: with_other_sensors(base, **{sensors_field: value})),
         measures=(measured.measure_estimates,),
         numbers=(Number("{series}: error of {icr} at {value:g} m/s", ERROR_COLUMN, "spread", "m", paper, largest),),
         title=f"{{value:g}} m/s of {word} moves y right by {{answer}}",
@@ -317,7 +317,7 @@ STUDIES: dict[str, Study] = {
         runs=20,
         values=(0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
         plan=replace(PLAN, path=PathPlan("lawnmower"), duration_s=300.0),
-        vary=by_preset(lambda base, value: with_sensors(base, gnss_std_m=value)),
+        vary=by_preset(lambda base, value: with_other_sensors(base, gnss_std_m=value)),
         measures=(measured.measure_estimates, measured.measure_times, measured.measure_open_loop),
         numbers=(
             Number("no slip: open loop after 10 m, p95", "blind_no_slip_10m_p95_m", "first", "m"),

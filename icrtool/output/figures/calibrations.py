@@ -202,8 +202,8 @@ def transfer(comparison: GroupComparison, *, ax: Axes | None = None) -> Figure |
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
-    errors, rows = _errors_of_groups(found), _differences(found)
-    names = " · ".join(found.groups)
+    errors, rows = _errors_of_groups(comparison), _differences(comparison)
+    names = " · ".join(comparison.groups)
     longest = max((len(one.words) for one in (*errors, *rows)), default=0)
     left_in = max(LEAST_LABELS_IN, 0.3 + CHARACTER_IN * longest)
     heights = [max(len(part), 2) for part in (errors, rows)]
@@ -265,7 +265,7 @@ def _differences(comparison: GroupComparison) -> list[Difference]:
     ]  # fmt: skip
     rows += [
         (one, f"{_group(one.tested_on)}, by {_group(one.calibrated_on)}'s − own, {one.horizon_m:g} m")
-        for one in found.costs
+        for one in comparison.costs
     ]
     if len(rows) > MOST_DIFFERENCES:
         rows = [(one, words) for one, words in rows if one.horizon_m == CHOICE_HORIZON_M]

@@ -112,7 +112,7 @@ def errors_data(report: DropoutDocument) -> dict[str, object]:
             for one in models
         ],
         "reference": {"p95": [row.p95_m for row in reference], "expected": [row.expected_m for row in reference]},
-        "banded": report.best.model if report.best is not None else next(iter(shown), ""),
+        "banded": report.best.model if report.best is not None else next(iter(shown_names), ""),
     }
 
 

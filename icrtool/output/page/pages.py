@@ -141,7 +141,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
         kind="Drive without GNSS: report of one log", blocks=blocks, pictures=pictures,
         duration_s=summary.drive.duration_s, directions=[word.lower() for word in direction_words(summary)], groups=(),
         folded_models=len(rows) - len(shown_rows(list(rows))),
-        sketch=drive_sketch(run, stated),
+        sketch=drive_sketch(run, report_document),
     )  # fmt: skip
 
 
