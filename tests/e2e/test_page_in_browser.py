@@ -124,6 +124,8 @@ def test_the_first_screen_has_a_picture_and_no_cut_number(chrome: Browser, file:
     page.open(file)
     visible = "[...document.querySelectorAll('.sketch svg')].filter((one) => one.getClientRects().length)"
     assert page.evaluate(f"{visible}[0].getBoundingClientRect().bottom") < height
+    if width == 1280:
+        assert page.evaluate("document.querySelector('.card.trust .big').getBoundingClientRect().bottom") < height
     table = "document.querySelector('.card.reach .scroll')"
     assert page.evaluate(f"{table}.scrollWidth - {table}.clientWidth") <= 0
     empty = (
