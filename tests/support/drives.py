@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool.records.samples import HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog
-from support.matrix_filter import step_state
+from support.matrix_filter import drive_states
 
 EPOCH_NS = 1_760_000_000_000_000_000
 ICRS = (0.5, -0.6, 0.1)
@@ -33,10 +33,7 @@ def make_log(
     t = np.arange(0.0, seconds, 1.0 / rate)
     v_left, v_right = 0.5 + 0.25 * np.sin(0.5 * t), 0.5 + 0.25 * np.sin(0.31 * t + 1.0)
     v_left, v_right = faster * v_left, faster * v_right
-    x = np.zeros((len(t), 6))
-    x[0] = [10.0, -5.0, 0.3, *icrs]
-    for k in range(len(t) - 1):
-        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 1.0 / rate, step_heading)
+    x = drive_states(np.array([10.0, -5.0, 0.3, *icrs]), v_left, v_right, 1.0 / rate, step_heading)
     stamps = EPOCH_NS + np.round(t * 1e9).astype(np.int64)
     every = max(int(rate / 20), 1)
     psi = x[::every, 2]

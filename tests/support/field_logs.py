@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from icrtool.kernels.arrays import Floats, Ints
 from support.drives import EPOCH_NS, ICRS
-from support.matrix_filter import step_state
+from support.matrix_filter import drive_states
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 RADIUS_M, WIDTH_M = 0.165, 0.55
@@ -55,10 +56,7 @@ def make_drive(seconds: float = 60.0, rate: float = 20.0, *, slower: float = 1.0
     t = np.arange(0.0, seconds, 1.0 / rate)
     v_left = slower * (0.5 + 0.4 * np.sin(0.5 * slower * t))
     v_right = slower * (0.5 + 0.4 * np.sin(0.31 * slower * t + 1.0))
-    x = np.zeros((len(t), 6))
-    x[0] = [0.0, 0.0, 0.3, *ICRS]
-    for k in range(len(t) - 1):
-        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 1.0 / rate)
+    x = drive_states(np.array([0.0, 0.0, 0.3, *ICRS]), v_left, v_right, 1.0 / rate)
     speeds = v_left / RADIUS_M, v_right / RADIUS_M
     angles = (np.append(0.0, np.cumsum(speed[:-1]) / rate) for speed in speeds)
     turn = np.append(np.diff(x[:, 2]) * rate, 0.0)
@@ -66,12 +64,15 @@ def make_drive(seconds: float = 60.0, rate: float = 20.0, *, slower: float = 1.0
 
 
 def made(kind: str, **fields: Any) -> Any:
-    """Return a message; fields that are not given are 0 or empty."""
+    """Return a message; fields that are not given are 0 or empty, and belong to all messages of the type."""
+    return STORE.types[kind](**_blank(kind) | fields)
+
+
+@functools.cache
+def _blank(kind: str) -> dict[str, Any]:
     values = {}
     for name, (node, detail) in STORE.fielddefs[kind][1]:
-        if name in fields:
-            values[name] = fields[name]
-        elif int(node) == 2:
+        if int(node) == 2:
             values[name] = made(detail)
         elif int(node) == 1:
             values[name] = "" if detail[0] == "string" else 0
@@ -79,7 +80,7 @@ def made(kind: str, **fields: Any) -> Any:
             (_, inner), count = detail
             numbers = isinstance(inner, tuple) and inner[0] != "string"
             values[name] = np.zeros(count if int(node) == 3 else 0, inner[0]) if numbers else []
-    return STORE.types[kind](**values)
+    return values
 
 
 def header(stamp_ns: int, frame: str = "base_link") -> Any:

@@ -42,6 +42,28 @@ def step_state(x: Floats, v_left: float, v_right: float, dt: float, step_heading
     return np.array([N + dt * (v_x * c - v_y * s), E + dt * (v_x * s + v_y * c), psi + dt * omega, y_r, y_l, x_v])
 
 
+def drive_states(
+    start: Floats, v_left: Floats, v_right: Floats, dt: Floats | float, step_heading: float = 0.0
+) -> Floats:
+    """Return the states (n, 6) of a drive: `step_state` from sample to sample (`dt` is one step, or n - 1 of them).
+
+    The ICRs are constant, therefore speeds and turn rates of all steps are known beforehand.
+    """
+    _, _, _, y_r, y_l, x_v = start
+    dt = np.broadcast_to(dt, len(v_left) - 1)
+    W = max(abs(y_r - y_l), MIN_ICR_SEPARATION_M)
+    v_x, omega = (v_left * y_r - v_right * y_l)[:-1] / W, (v_left - v_right)[:-1] / W
+    v_y = -omega * x_v
+    x = np.tile(np.asarray(start, np.float64), (len(v_left), 1))
+    x[1:, 2] = dt * omega
+    x[:, 2] = np.cumsum(x[:, 2])
+    heading = x[:-1, 2] + step_heading * dt * omega
+    c, s = np.cos(heading), np.sin(heading)
+    x[1:, 0], x[1:, 1] = dt * (v_x * c - v_y * s), dt * (v_x * s + v_y * c)
+    x[:, :2] = np.cumsum(x[:, :2], axis=0)
+    return x
+
+
 def state_jacobian(
     x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0, *, printed: bool = False
 ) -> Floats:

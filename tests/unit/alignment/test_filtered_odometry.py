@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats
@@ -15,13 +14,15 @@ from icrtool.pipeline import fit
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog
 from support.drives import EPOCH_NS
-from support.matrix_filter import step_state
+from support.matrix_filter import drive_states
 
 WIDTH_M, ICRS, RATE_HZ, SECONDS = 0.8, (0.7, -0.7, 0.05), 50.0, 300.0
 CONFIG = load_config(sets=[f"robot.track_width_m={WIDTH_M}"])
 
 
 def low_passed(x: Floats, tau_s: float) -> Floats:
+    from scipy.signal import lfilter
+
     a = 1.0 / (RATE_HZ * tau_s + 1.0)
     return np.asarray(lfilter([a], [1.0, a - 1.0], x))
 
@@ -33,10 +34,7 @@ def log_of(seed: int, odometry: str, tau_s: float = 1.0) -> RobotLog:
     periods = (3.7, 6.1, 11.0, 23.0)
     apart = 0.25 + sum(rng.uniform(0.1, 0.35) * np.sin(2 * np.pi * t / p + rng.uniform(0.0, 6.0)) for p in periods)
     v = 0.6 + 0.2 * np.sin(0.11 * t)
-    states = np.zeros((len(t), 6))
-    states[0, 3:] = ICRS
-    for k in range(len(t) - 1):
-        states[k + 1] = step_state(states[k], v[k] + apart[k] / 2, v[k] - apart[k] / 2, 1.0 / RATE_HZ, 0.5)
+    states = drive_states(np.array([0.0, 0.0, 0.0, *ICRS]), v + apart / 2, v - apart / 2, 1.0 / RATE_HZ, 0.5)
     turn, true = apart / WIDTH_M, np.append(np.diff(states[:, 2]) * RATE_HZ, 0.0)
     if odometry == "low-passed":
         turn, v = low_passed(turn, tau_s), low_passed(v, tau_s)

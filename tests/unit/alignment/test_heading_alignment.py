@@ -20,7 +20,7 @@ from icrtool.records.run import Run
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 from support.drives import ICRS, make_log
-from support.matrix_filter import step_state
+from support.matrix_filter import drive_states
 
 WIDTH = "robot.track_width_m=0.8"
 ICR_TOLERANCE_M = 0.02
@@ -74,11 +74,9 @@ def rows_to_and_fro() -> RobotLog:
     log, step_s = clean(), 0.02
     row = np.concatenate([np.zeros(2500), np.full(157, 1.0), np.zeros(2500), np.full(157, -1.0)])
     turn = np.tile(row, 2)
-    width, x = ICRS[0] - ICRS[1], np.zeros((len(turn), 6))
+    width = ICRS[0] - ICRS[1]
     v_left, v_right = 0.5 + turn * width / 2, 0.5 - turn * width / 2
-    x[0] = [0.0, 0.0, 0.4, *ICRS]
-    for k in range(len(turn) - 1):
-        x[k + 1] = step_state(x[k], v_left[k], v_right[k], step_s)
+    x = drive_states(np.array([0.0, 0.0, 0.4, *ICRS]), v_left, v_right, step_s)
     stamps = log.wheels.stamp_ns[0] + np.arange(len(turn)) * round(step_s * 1e9)
     known, rng = np.full(len(turn), 1e-4), np.random.default_rng(3)
     north, east = (x[:, :2] + rng.normal(0.0, 0.01, (len(turn), 2))).T
@@ -150,10 +148,7 @@ def rows(straight_m: float = 40.0, speed: float = 1.0) -> RobotLog:
     row, turn = np.zeros(int(straight_m / speed * rate)), np.full(int(turn_s * rate), 0.4)
     ahead = np.concatenate([row, turn, row, -turn, row, turn, row])
     v_left, v_right = speed + ahead, speed - ahead
-    x = np.zeros((len(ahead), 6))
-    x[0] = [0.0, 0.0, 0.3, *ICRS]
-    for k in range(len(x) - 1):
-        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 1 / rate, 0.5)
+    x = drive_states(np.array([0.0, 0.0, 0.3, *ICRS]), v_left, v_right, 1 / rate, 0.5)
     stamps = clean().wheels.stamp_ns[0] + np.round(np.arange(len(x)) / rate * 1e9).astype(np.int64)
     fix = slice(0, None, 5)
     place = x[fix, :2] + np.random.default_rng(1).normal(0, 0.01, (len(x[fix]), 2))

@@ -17,7 +17,7 @@ from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog
-from support.matrix_filter import step_state
+from support.matrix_filter import drive_states
 
 START_NS = 1_760_000_000_000_000_000
 ICRS = (0.5, -0.6, 0.1)
@@ -33,10 +33,7 @@ def stop_and_go(seed: int = 1, *, heading_late_s: float = 0.0, fixes_late_s: flo
     speed = 0.6 + 0.25 * np.sign(np.sin(0.8 * t)) * np.minimum(1.0, 3.0 * np.abs(np.sin(0.8 * t)))
     turn = 0.3 * np.sin(0.45 * t) + 0.1 * np.sin(1.7 * t)
     v_left, v_right = speed + turn / 2, speed - turn / 2
-    x = np.zeros((len(t), 6))
-    x[0] = [0.0, 0.0, 0.3, *ICRS]
-    for k in range(len(t) - 1):
-        x[k + 1] = step_state(x[k], v_left[k], v_right[k], 0.02)
+    x = drive_states(np.array([0.0, 0.0, 0.3, *ICRS]), v_left, v_right, 0.02)
     stamps = START_NS + np.round(t * 1e9).astype(np.int64)
     fix = slice(0, None, 5)
     count = len(t[fix])
@@ -114,10 +111,7 @@ def exact_circle() -> RobotLog:
     log = stop_and_go(fixes_late_s=0.3)
     even = np.full(len(log.wheels.stamp_ns), 0.6)
     turning = replace(log, wheels=replace(log.wheels, left=even + 0.1, right=even - 0.1))
-    x = np.zeros((len(even), 6))
-    x[0] = [0.0, 0.0, 0.3, *ICRS]
-    for k in range(len(even) - 1):
-        x[k + 1] = step_state(x[k], 0.7, 0.5, 0.02)
+    x = drive_states(np.array([0.0, 0.0, 0.3, *ICRS]), even + 0.1, even - 0.1, 0.02)
     return replace(
         turning,
         gnss=replace(log.gnss, north_m=x[::5, 0], east_m=x[::5, 1]),

@@ -15,7 +15,7 @@ from icrtool.records.run import Run
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog
 from support.drives import EPOCH_NS
-from support.matrix_filter import step_state
+from support.matrix_filter import drive_states
 
 TRUTH = (0.70, -0.70, -0.10)
 DRIVEN_S, FINE_HZ = 600.0, 20.0
@@ -33,15 +33,14 @@ def parked_log(early: int, day_s: float) -> RobotLog:
     x, wheels = np.array([10.0, -5.0, 0.3, *TRUTH]), np.zeros(2)
     times, states = [], []
     for day in range(3):
-        for k in range(len(t)):
-            states.append([*x[:3], *wheels])
-            if k + 1 < len(t):
-                x = step_state(x, v_left[k], v_right[k], 1.0 / FINE_HZ, 0.5)
-                wheels = wheels + np.array([v_left[k], v_right[k]]) / FINE_HZ
+        drive = drive_states(x, v_left, v_right, 1.0 / FINE_HZ, 0.5)
+        turned = wheels + np.cumsum([[0.0, 0.0], *np.column_stack([v_left, v_right])[:-1] / FINE_HZ], axis=0)
+        states.append(np.hstack([drive[:, :3], turned]))
+        x, wheels = drive[-1], turned[-1]
         times.append((day + 0.5) * day_s + t)
     stamps_s = np.arange(0.0, 3.0 * day_s)
     north, east, heading, left, right = (
-        np.interp(stamps_s, np.concatenate(times), column) for column in np.array(states).T
+        np.interp(stamps_s, np.concatenate(times), column) for column in np.concatenate(states).T
     )
     left, right = (np.append(one[early:], np.full(early, one[-1])) for one in (left, right))
     count = len(stamps_s)
@@ -100,11 +99,10 @@ def run_then_parked(hours: float) -> Run:
     ramp = np.clip(np.minimum(t, DRIVEN_S - t) / 2.0, 0.0, 1.0)
     v_left = ramp * (0.5 + 0.3 * np.sin(2 * np.pi * t / 13.0) + 0.2 * np.sin(2 * np.pi * t / 37.0))
     v_right = ramp * (0.5 + 0.3 * np.sin(2 * np.pi * t / 17.0 + 1.0) - 0.15 * np.sin(2 * np.pi * t / 29.0))
-    states = [np.array([10.0, -5.0, 0.3, *TRUTH])]
-    for k in range(driven - 1):
-        states.append(step_state(states[-1], v_left[k], v_right[k], 1.0 / rate_hz, 0.5))
+    start = np.array([10.0, -5.0, 0.3, *TRUTH])
+    states = drive_states(start, v_left[:driven], v_right[:driven], 1.0 / rate_hz, 0.5)
     count, stamp_ns = len(t), EPOCH_NS + np.round(t * 1e9).astype(np.int64)
-    poses = np.array(states)[np.minimum(np.arange(count), driven - 1), :3]
+    poses = states[np.minimum(np.arange(count), driven - 1), :3]
     # drawn row by row: the same noise on the same drive, whatever follows
     poses = poses + rng.normal(size=(count, 3)) * [0.01, 0.01, math.radians(1.0)]
     variance, of_heading = np.full(count, 0.01**2), np.full(count, math.radians(1.0) ** 2)

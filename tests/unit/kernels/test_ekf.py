@@ -9,7 +9,7 @@ import pytest
 
 from icrtool.kernels.ekf import run_ekf, wrap
 from icrtool.kernels.filter_records import GATED, PRINTED, RECOVERED, UNSEEN, USED, FilterInputs, FilterParameters
-from support.matrix_filter import run_ekf_plain, state_jacobian, step_state
+from support.matrix_filter import drive_states, run_ekf_plain, state_jacobian, step_state
 
 PAPER_Q = (0.2**2, 0.2**2, math.radians(5.0) ** 2, 1e-4, 1e-4, 1e-4)
 TWIN_TOLERANCE = 1e-9
@@ -54,10 +54,7 @@ def drive(
         t = np.sort(t + rng.uniform(0, 0.3 / rate, len(t)))
     v_left = 0.4 + 0.25 * np.sin(0.5 * t + rng.uniform(0, 6))
     v_right = 0.4 + 0.25 * np.sin(0.7 * t + rng.uniform(0, 6))
-    x = np.zeros((len(t), 6))
-    x[0] = [3.0, -2.0, 2.5, *icrs]
-    for k in range(len(t) - 1):
-        x[k + 1] = step_state(x[k], v_left[k], v_right[k], t[k + 1] - t[k], 0.5)
+    x = drive_states(np.array([3.0, -2.0, 2.5, *icrs]), v_left, v_right, np.diff(t), 0.5)
 
     def at(times: np.ndarray) -> np.ndarray:
         return np.column_stack([np.interp(times, t, column) for column in x.T])
@@ -142,6 +139,16 @@ def test_the_size_of_compiled_blocks_changes_nothing(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("icrtool.kernels.ekf.BLOCK_EVENTS", 50)
     for name, one, other in zip(whole._fields, whole, run_ekf(data, t0, x0, P0, settings), strict=True):
         np.testing.assert_array_equal(one, other, err_msg=name)
+
+
+@pytest.mark.parametrize("icrs", [(0.5, -0.75, -0.25), (-0.4, 0.3, 0.1), (0.0005, -0.0005, 0.1)])
+def test_a_drive_of_the_oracle_is_its_steps_one_after_the_other(icrs: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(4)
+    v_left, v_right = rng.normal(0.5, 0.3, (2, 200))
+    dt = rng.uniform(0.01, 0.1, 199)
+    states = drive_states(np.array([3.0, -2.0, 2.5, *icrs]), v_left, v_right, dt, 0.5)
+    for before, after, left, right, step in zip(states[:-1], states[1:], v_left, v_right, dt, strict=False):
+        np.testing.assert_allclose(after, step_state(before, left, right, step, 0.5), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("step_heading", [0.0, 0.5])
