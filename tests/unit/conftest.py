@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,8 +20,9 @@ def run() -> Run:
 
 @pytest.fixture(scope="session")
 def make_run() -> Callable[..., Run]:
-    """Fit a drive of another kind: keywords of `simulate`, and `track_width_m`."""
+    """Fit a drive of another kind, each kind once: keywords of `simulate`, and `track_width_m`."""
 
+    @functools.cache
     def make(*, track_width_m: float | None = TRACK_WIDTH_M, **drive: Any) -> Run:
         return fit(simulate(**drive), configured(track_width_m))
 
