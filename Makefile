@@ -85,9 +85,10 @@ where: $(READY)  ## where something is in the code: make where WORDS="wheel radi
 types: $(DEV)  ## mypy, strict
 	$(BIN)/mypy
 
-# Two processes, each with whole files of tests: fixtures of a module are made once.
+# Two processes, each with whole files of tests: fixtures of a module are made once. In the order of the folders: files of
+# few tests are among the longest, and xdist would leave them for the end, when one process waits.
 test: $(DEV)  ## the tests, without the stress tests; JOBS=0 runs them in one process
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 PKG ?= kernels
 quick: $(DEV)  ## ruff, mypy and the tests of one package, below a minute: make quick PKG=alignment

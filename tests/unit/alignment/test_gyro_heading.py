@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import icrtool
 from icrtool.alignment.corrections import align_streams
@@ -48,6 +47,13 @@ def error_deg(samples: HeadingSamples, truth: Truth) -> np.ndarray:
     return np.where(samples.stamp_ns - truth[0][0] < FIRST_S * 1e9, 0.0, error)
 
 
+def first_order(kept: float, push: np.ndarray) -> np.ndarray:
+    """Return errors of which a share is kept from sample to sample, along the last axis."""
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([1.0], [1.0, -kept], push))
+
+
 @pytest.mark.parametrize(("axis", "sign"), [(2, -1.0), (2, 1.0), (0, -1.0), (1, 1.0)])
 def test_axis_and_sense_of_the_gyro_are_found(axis: int, sign: float) -> None:
     log, truth = without_heading(1, axis, sign)
@@ -65,7 +71,7 @@ def test_a_gyro_on_its_side_is_found_beside_fixes_that_wander(axis: int, sign: f
     kept = math.exp(-float(np.median(np.diff(fixes.stamp_ns))) / 60e9)
     push = rng.normal(0.0, 0.8 * math.sqrt(1.0 - kept**2), (2, len(fixes.stamp_ns)))
     push[:, 0] = rng.normal(0.0, 0.8, 2)
-    north, east = lfilter([1.0], [1.0, -kept], push, axis=1) + rng.normal(0.0, 0.1, push.shape)
+    north, east = first_order(kept, push) + rng.normal(0.0, 0.1, push.shape)
     variance = np.ones(len(fixes.stamp_ns))
     wandering = replace(
         fixes, north_m=fixes.north_m + north, east_m=fixes.east_m + east, var_north_m2=variance, var_east_m2=variance
@@ -85,7 +91,7 @@ def with_attitude(log: RobotLog, truth: Truth, seed: int, offset_deg: float = 0.
     kept = math.exp(-0.01 / 30.0)
     push = rng.normal(0.0, 0.85 * math.sqrt(1.0 - kept**2), len(psi))
     push[0] = rng.normal(0.0, 0.85)
-    error = np.radians(lfilter([1.0], [1.0, -kept], push) + rng.normal(0.0, 0.5, len(psi)) + offset_deg)
+    error = np.radians(first_order(kept, push) + rng.normal(0.0, 0.5, len(psi)) + offset_deg)
     heading = np.interp(t - lag_s, t, psi) + error
     samples = HeadingSamples(stamps, np.angle(np.exp(1j * heading)), np.full(len(psi), math.radians(1.0) ** 2))
     return replace(log, heading=samples)

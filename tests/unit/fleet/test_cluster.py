@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ import pytest
 from icrtool.output.run_directory import open_run
 from support.servers import object_store
 
-pytest.importorskip("distributed", reason="needs the extra icrtool[cluster]")
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra icrtool[cluster]")
 ROOT = Path(__file__).parents[3]
 LOGS = 5
 
