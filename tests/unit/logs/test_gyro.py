@@ -65,7 +65,7 @@ def test_turn_rates_in_degrees_are_converted_and_named(
     tmp_path: Path, unit: float, slower: float, has_heading: bool, noise_radps: float
 ) -> None:
     """Of a robot that turns up to 40 deg/s, or ten times slower, with and without an orientation beside the rates."""
-    drive = make_drive(60.0 / slower, 20.0, slower=slower)
+    drive = make_drive(60.0 / slower, 20.0 if slower == 1.0 else 5.0, slower=slower)
     sent = imus(drive, unit=unit, noise=noise_radps * slower, oriented=has_heading)
     log = read_log(
         write_messages(tmp_path / "log.mcap", joint_states(drive), fixes(drive), sent), load_config(sets=ROBOT)
