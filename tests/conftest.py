@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from hypothesis import settings
 
 # Threads of OpenBLAS wait in a loop for the next matrix: an eighth to a fifth of the CPU time of the tests. NumPy reads
@@ -21,6 +22,26 @@ def interrupts_arrive() -> None:
     """A shell starts what runs in the background with SIGINT ignored; the processes of the tests would inherit that."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+SHORT_DRIVE = (
+    "--path", "lawnmower", "--speed", "0.8", "--duration", "90", "--wheel-rate", "20", "--heading-rate", "20",
+    "--gnss-rate", "5",
+)  # fmt: skip
+"""Options of `icrtool simulate`: all rows of a report, and a tenth of the messages of a sample log."""
+
+
+@pytest.fixture(scope="session")
+def short_logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with short drives of a husky-a200: field.mcap, other.bag and the directory third with third.db3."""
+    from icrtool.cli.simulate import simulate_command
+
+    folder = tmp_path_factory.mktemp("short_logs")
+    for seed, log in enumerate(("field.mcap", "other.bag", "third"), start=1):
+        words = ("-o", str(folder / log), "--robot", "husky-a200", "--seed", str(seed), "-q", *SHORT_DRIVE)
+        done = CliRunner().invoke(simulate_command, words, catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    return folder
 
 
 @pytest.fixture(scope="session")

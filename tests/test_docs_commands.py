@@ -29,6 +29,7 @@ ELSEWHERE = {
     "docs/how-to/autopilot.md": "tests/test_docs_autopilot.py runs it on logs of both autopilots",
 }
 NOT_RUN = {
+    "icrtool demo": "tests/e2e/test_demo.py runs it",
     "icrtool batch /shared/season -o /shared/results --scheduler tcp://host:8786": "needs a cluster; "
     "tests/unit/fleet/test_cluster.py runs one of Dask on this machine",
 }

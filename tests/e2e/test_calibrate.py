@@ -15,11 +15,17 @@ from icrtool.config import load_config
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
-ROBOT = ("--robot", "segway-rmp400")
+ROBOT, HUSKY = ("--robot", "segway-rmp400"), ("--robot", "husky-a200")
+RATES = ("--wheel-rate", "20", "--heading-rate", "20", "--gnss-rate", "5")
 
 
-def test_a_log_is_calibrated_printed_and_written(icrtool, tmp_path: Path) -> None:
-    status, out, err = icrtool("calibrate", LOG, *ROBOT, "-o", tmp_path / "calibration.json", "-v")
+@pytest.fixture
+def field(short_logs: Path) -> Path:
+    return short_logs / "field.mcap"
+
+
+def test_a_log_is_calibrated_printed_and_written(icrtool, field: Path, tmp_path: Path) -> None:
+    status, out, err = icrtool("calibrate", field, *HUSKY, "-o", tmp_path / "calibration.json", "-v")
     assert status == 0, err
     assert "antenna forward − x ICR" in out
     assert "not separable" in out
@@ -30,41 +36,41 @@ def test_a_log_is_calibrated_printed_and_written(icrtool, tmp_path: Path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]
 
 
-def test_the_misses_are_drawn_before_and_after(icrtool, tmp_path: Path) -> None:
-    status, out, err = icrtool("calibrate", LOG, *ROBOT, "--plot", "misses.png")
+def test_the_misses_are_drawn_before_and_after(icrtool, field: Path, tmp_path: Path) -> None:
+    status, out, err = icrtool("calibrate", field, *HUSKY, "--plot", "misses.png")
     assert (status, err) == (0, "")
     assert "drawn to misses.png" in out
     assert (tmp_path / "misses.png").read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in tmp_path.iterdir()] == ["misses.png"]
-    status, _, err = icrtool("calibrate", LOG, *ROBOT, "--plot", "misses.txt")
+    status, _, err = icrtool("calibrate", field, *HUSKY, "--plot", "misses.txt")
     assert status == 1
     assert "no format of a picture" in err
 
 
-def test_a_picture_that_cannot_be_written_is_one_error(icrtool, monkeypatch) -> None:
+def test_a_picture_that_cannot_be_written_is_one_error(icrtool, field: Path, monkeypatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise OSError(30, "Read-only file system")
 
     for name in ("write_bytes", "replace", "unlink"):
         monkeypatch.setattr(Path, name, refuse)
-    status, _, err = icrtool("calibrate", LOG, *ROBOT, "--plot", "misses.png", "-q")
+    status, _, err = icrtool("calibrate", field, *HUSKY, "--plot", "misses.png", "-q")
     assert (status, err) == (1, "Error: misses.png: cannot be written; Read-only file system\n")
 
 
-def test_a_home_directory_that_cannot_be_written_is_no_matter(tmp_path: Path) -> None:
+def test_a_home_directory_that_cannot_be_written_is_no_matter(tmp_path: Path, field: Path) -> None:
     (tmp_path / "file").touch()
     environment = {**os.environ, "MPLCONFIGDIR": str(tmp_path / "file" / "below"), "TMPDIR": str(tmp_path)}
-    command = [sys.executable, "-m", "icrtool", "calibrate", LOG, *ROBOT, "--plot", tmp_path / "misses.png"]
+    command = [sys.executable, "-m", "icrtool", "calibrate", field, *HUSKY, "--plot", tmp_path / "misses.png"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert done.stderr == ""
 
 
-def test_a_run_is_calibrated_with_its_configuration(icrtool, tmp_path: Path) -> None:
-    icrtool("fit", LOG, *ROBOT, "-o", "run", "--plots", "none", "-q")
+def test_a_run_is_calibrated_with_its_configuration(icrtool, field: Path, tmp_path: Path) -> None:
+    icrtool("fit", field, *HUSKY, "-o", "run", "--plots", "none", "-q")
     status, by_run, _ = icrtool("calibrate", "run")
     assert status == 0
-    assert by_run == icrtool("calibrate", LOG, *ROBOT)[1]
-    status, _, err = icrtool("calibrate", "run", *ROBOT)
+    assert by_run == icrtool("calibrate", field, *HUSKY)[1]
+    status, _, err = icrtool("calibrate", "run", *HUSKY)
     assert status == 1
     assert "keeps the configuration" in err
 
@@ -77,23 +83,23 @@ def test_settings_can_be_pasted(icrtool) -> None:
     assert load_config(sets=sets).wheels.left_scale == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_known_antenna_is_used(icrtool) -> None:
-    _, out, _ = icrtool("calibrate", LOG, *ROBOT, "--set", "frames.antenna_forward_m=0.0", "-v")
+def test_a_known_antenna_is_used(icrtool, field: Path) -> None:
+    _, out, _ = icrtool("calibrate", field, *HUSKY, "--set", "frames.antenna_forward_m=0.0", "-v")
     assert "with the antenna as given" in out
 
 
 @pytest.mark.parametrize("place", ["other.json", "missing/calibration.json"])
-def test_nothing_foreign_is_overwritten(icrtool, tmp_path: Path, place: str) -> None:
+def test_nothing_foreign_is_overwritten(icrtool, field: Path, tmp_path: Path, place: str) -> None:
     (tmp_path / "other.json").write_text("{}")
-    status, out, err = icrtool("calibrate", LOG, *ROBOT, "-o", place)
+    status, out, err = icrtool("calibrate", field, *HUSKY, "-o", place)
     assert (status, out) == (1, "")
     assert err.startswith("Error: ")
     assert len(err.splitlines()) == 1
     assert (tmp_path / "other.json").read_text() == "{}"
 
 
-def test_quiet_prints_nothing(icrtool) -> None:
-    assert icrtool("calibrate", LOG, *ROBOT, "-q") == (0, "", "")
+def test_quiet_prints_nothing(icrtool, field: Path) -> None:
+    assert icrtool("calibrate", field, *HUSKY, "-q") == (0, "", "")
 
 
 def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> None:
@@ -113,7 +119,7 @@ def test_several_runs_are_pooled_and_each_is_left_out(icrtool, tmp_path: Path) -
     from icrtool.output.files.formats import open_calibration
 
     for seed in (1, 2, 3):
-        drive = ("--path", "curved", "--duration", "90", "--seed", seed, "-q")
+        drive = ("--path", "curved", "--duration", "90", "--seed", seed, "-q", *RATES)
         icrtool("simulate", "-o", f"{seed}.mcap", *drive, *ROBOT)
     icrtool("fit", "2.mcap", *ROBOT, "-o", "run", "--plots", "none", "-q")
     status, out, err = icrtool("calibrate", "1.mcap", "3.mcap", *ROBOT, "-o", "cal.json", "-q")

@@ -102,7 +102,8 @@ def test_what_is_not_in_the_baseline_is_reported_and_all_of_it_is_an_error(place
         report = (place / "baseline" / one["run"] / "dropout" / "report.json").read_text(encoding="utf-8")
         (baseline / one["run"] / "dropout" / "report.json").write_text(report, encoding="utf-8")
     (baseline / "fleet.json").write_text(json.dumps(document), encoding="utf-8")
-    command = ("batch", "logs", "-o", "results", "--robot", "husky-a200", "--plots", "none", "--baseline", "alone")
+    lean = ("--plots", "none", "--no-ladder", "--no-page")
+    command = ("batch", "logs", "-o", "results", "--robot", "husky-a200", *lean, "--baseline", "alone")
     gate = ("--gate", "icr.p95@5m <= 2 * baseline")
     status, out, err = icrtool(*command, *gate, "--set", "filter.process_icr_mps=0.011", "--json", "--junit", "j.xml")
     assert status == 0, err

@@ -54,7 +54,7 @@ def set_writable(folder: Path, *, writable: bool) -> None:
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(tmp_path_factory: pytest.TempPathFactory, short_logs: Path) -> Path:
     """A repository with a log and the checkout of icrtool in it: what an image is built of, and the action."""
     place = tmp_path_factory.mktemp("repository")
     ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
@@ -68,18 +68,13 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copy(found, copied)
     set_writable(place / "icrtool", writable=False)
     (place / "logs").mkdir()
-    shutil.copy(ROOT / "sample_logs" / "wheeled_lawnmower.mcap", place / "logs" / "field.mcap")
+    shutil.copy(short_logs / "field.mcap", place / "logs" / "field.mcap")
     return place
 
 
 def action(place: Path, temp: Path, given: dict[str, Any], **more: Any) -> Action:
-    """Return the action of a step, with its robot replaced by that of the sample log."""
-    return Action(
-        place / "icrtool" / ".github" / "actions" / "icrtool" / "action.yml",
-        given | {"robot": "segway-rmp400"},
-        temp,
-        **more,
-    )
+    """Return the action of a step."""
+    return Action(place / "icrtool" / ".github" / "actions" / "icrtool" / "action.yml", given, temp, **more)
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +138,7 @@ def test_commands_compile_nothing_from_a_read_only_environment(place: Path, acti
     held = sorted(cache.rglob("*"))
     set_writable(cache, writable=False)
     try:
-        for command in ("fit logs/field.mcap --robot segway-rmp400 -o run", "dropout-report run"):
+        for command in ("fit logs/field.mcap --robot husky-a200 -o run", "dropout-report run"):
             counted = in_bash(f". {activate} && exec python -c '{COMMAND}' {command} --plots none -q", place, {})
             assert counted.returncode == 0, counted.stderr
             assert counted.stderr.splitlines()[-1] == "0"
@@ -173,7 +168,7 @@ def gitlab_job(place: Path, inputs: dict[str, str], before: str = "") -> Any:
 
 def test_the_gitlab_job_of_the_page_runs_in_an_image_with_icrtool(place: Path, activate: Path) -> None:
     [include] = INCLUDE["include"]
-    inputs = include["inputs"] | {"robot": "segway-rmp400"}
+    inputs = include["inputs"]
     done = gitlab_job(place, inputs, f". {activate}")
     assert done.returncode == 0, done.stderr
     for pattern in [*TEMPLATE["icrtool"]["artifacts"]["paths"], TEMPLATE["icrtool"]["artifacts"]["reports"]["junit"]]:
@@ -204,7 +199,7 @@ def test_the_lines_for_a_shell_end_in_a_verdict(place: Path, activate: Path) -> 
     made, activated, command = SHELL.splitlines()
     assert made == "icrtool/scripts/container-setup.sh .icrtool", "which the action has run"
     assert activated == ". .icrtool/bin/activate"
-    lines = f". {activate}\n{command.replace('husky-a200', 'segway-rmp400')} --no-page --plots none"
+    lines = f". {activate}\n{command} --no-page --plots none"
     done = in_bash(lines, place, {})
     assert done.returncode == 0, done.stderr
     assert json.loads((place / "results" / "fleet.json").read_bytes())["logs"][0]["verdicts"][0]["passed"]

@@ -18,9 +18,9 @@ import pytest
 from icrtool.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
-LOG = ROOT / "sample_logs" / "wheeled_figure_eight"
-RUN = Path("icrtool-runs") / LOG.name
-ROBOT = ("--robot", "segway-rmp400")
+LOG = "third"
+RUN = Path("icrtool-runs") / LOG
+ROBOT = ("--robot", "husky-a200")
 PICTURES = {"summary", "histogram", "worst", "error_map"}
 NO_PLOTS = ("--plots", "none")
 EASY, HARD = "icr.p95@10m <= 100", "icr.p95@10m <= 0.001"
@@ -49,12 +49,12 @@ def report_here(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[st
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fitted(tmp_path_factory: pytest.TempPathFactory, short_logs: Path) -> Path:
     """A folder in which a copy of the log was fitted and reported on in one go, with all that can be asked for."""
     folder = tmp_path_factory.mktemp("field")
-    shutil.copytree(LOG, folder / LOG.name)
+    shutil.copytree(short_logs / LOG, folder / LOG)
     done = report(
-        folder, LOG.name, *ROBOT, "--outage", 10, "--trials", "--gate", EASY, "--gate", "no_slip.max@7.5 < 0.01",
+        folder, LOG, *ROBOT, "--outage", 10, "--trials", "--gate", EASY, "--gate", "no_slip.max@7.5 < 0.01",
         "--budget", 0.5, "--budget", 2, "--junit", "gates.xml", "--markdown", "pr.md",
     )  # fmt: skip
     (folder / "done.json").write_text(json.dumps([done.returncode, done.stdout, done.stderr]), encoding="utf-8")
@@ -107,7 +107,7 @@ def test_all_files_say_the_same(fitted: Path) -> None:
 
 
 def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(folder: Path) -> None:
-    shutil.rmtree(folder / LOG.name)
+    shutil.rmtree(folder / LOG)
     before = {name: (folder / RUN / name).read_bytes() for name in ("states.csv", "run.json")}
     done = report(folder, "--horizons", "2,10", "--plots", "none", "--gate", EASY)
     assert done.returncode == 0, done.stderr
@@ -127,7 +127,7 @@ def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(fold
 
 def test_forced_outages_on_a_stored_run_need_no_log_and_give_the_same(folder: Path) -> None:
     stored = json.loads((folder / RUN / "dropout" / "report.json").read_bytes())["outages"]
-    shutil.rmtree(folder / LOG.name)
+    shutil.rmtree(folder / LOG)
     done = report(folder, RUN, "--outage", 10, "--plots", "none", "-q")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert json.loads((folder / RUN / "dropout" / "report.json").read_bytes())["outages"] == stored
@@ -210,7 +210,7 @@ def test_the_smoother_may_be_the_reference(folder: Path, report_here) -> None:
     status, _, err = report_here(folder, RUN, "--reference", "smoothed")
     assert status == 1
     assert "it has no smoothed states; run icrtool fit --smooth" in err
-    status, out, _ = report_here(folder, LOG.name, *ROBOT, "--reference", "smoothed", "--no-ladder", "-v")
+    status, out, _ = report_here(folder, LOG, *ROBOT, "--reference", "smoothed", "--no-ladder", "-v")
     assert status == 0
     assert "compared with the smoothed trajectory" in " ".join(out.split())
     assert "held out in turn" not in out
@@ -228,7 +228,7 @@ def test_the_ladder_holds_the_rows_of_the_summary(fitted: Path) -> None:
     summary = pd.read_csv(fitted / RUN / "dropout" / "summary.csv")
     names = [model["name"] for model in document["models"]]
     wheels = {"icr", "no_slip", "icr_final", "controller", "recommended", "adaptive"}
-    assert set(names) == wheels | {f"{name}_gyro" for name in wheels}
+    assert set(names) == wheels | {f"{name}_gyro" for name in wheels} | {"vendor"}
     assert list(summary.model.unique()) == names
     fitted_to = {model["name"]: model["fitted"] for model in document["models"]}
     assert fitted_to["recommended"] == "the rest of the drive"

@@ -11,19 +11,16 @@ from ruamel.yaml import YAML
 from icrtool.cli.export import CONTROLLERS
 from support.documents import with_summary
 
-ROOT = Path(__file__).resolve().parents[2]
-LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
-
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory: pytest.TempPathFactory, short_logs: Path) -> Path:
     from icrtool.logs.read_log import read_log
     from icrtool.output.run_directory import write_run
     from icrtool.pipeline import fit
 
-    config = __import__("icrtool").load_config(robot="segway-rmp400")
+    config = __import__("icrtool").load_config(robot="husky-a200")
     folder = tmp_path_factory.mktemp("runs")
-    write_run(fit(read_log(LOG, config), config), folder / "icrtool-runs" / "mower", plots=())
+    write_run(fit(read_log(short_logs / "field.mcap", config), config), folder / "icrtool-runs" / "mower", plots=())
     return folder
 
 
@@ -43,8 +40,8 @@ def test_without_an_argument_the_newest_run_is_taken(icrtool) -> None:
     assert icrtool("export", "--for", "clearpath") == icrtool("export", "--for", "clearpath", "icrtool-runs/mower")
 
 
-def test_a_log_is_no_run(icrtool) -> None:
-    status, out, err = icrtool("export", "--for", "json", LOG)
+def test_a_log_is_no_run(icrtool, short_logs: Path) -> None:
+    status, out, err = icrtool("export", "--for", "json", short_logs / "field.mcap")
     assert (status, out) == (1, "")
     assert err.startswith("Error: ")
 
@@ -127,12 +124,13 @@ def test_a_calibration_that_is_not_fit_for_use_is_exported_by_force_only(icrtool
     assert icrtool("export", "--for", "clearpath", "--force", file)[0] == 0
 
 
-def test_an_export_does_not_replace_the_log_of_its_run(icrtool) -> None:
-    content = LOG.read_bytes()
-    status, _, err = icrtool("export", "--for", "foxglove", "-o", LOG)
+def test_an_export_does_not_replace_the_log_of_its_run(icrtool, short_logs: Path) -> None:
+    log = short_logs / "field.mcap"
+    content = log.read_bytes()
+    status, _, err = icrtool("export", "--for", "foxglove", "-o", log)
     assert status == 1
     assert "log" in err
-    assert LOG.read_bytes() == content
+    assert log.read_bytes() == content
 
 
 def test_an_export_is_no_log_of_wheels(icrtool, tmp_path: Path) -> None:

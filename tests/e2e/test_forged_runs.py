@@ -296,11 +296,12 @@ def test_what_is_written_beside_or_into_a_place_replaces_links(
 
 @pytest.mark.parametrize("failing", [("--outage-at", "5"), ("--gate", "calibration.p95@10m <= 1")])
 def test_a_report_that_fails_keeps_the_old_run_whole(
-    icrtool: Command, home: Home, run_place: Path, made: Path, failing: tuple[str, ...]
+    icrtool: Command, home: Home, run_place: Path, made: Path, short_logs: Path, failing: tuple[str, ...]
 ) -> None:
     old = Path(shutil.copytree(made, run_place / "old"))
     before = {path: path.read_bytes() for path in old.rglob("*") if path.is_file()}
-    command = ("dropout-report", LOG, "--plots", "none", "--no-ladder", "--overwrite", "-q")
+    asked = ("--robot", "husky-a200", "--plots", "none", "--no-ladder", "--overwrite", "-q")
+    command = ("dropout-report", short_logs / "field.mcap", *asked)
     status, _, errors = icrtool(*command, "-o", old, *failing)
     assert status in (1, 2)
     assert "Error: " in errors

@@ -22,8 +22,7 @@ from icrtool.records.calibration_document import (
 )
 from support.barn import configured, simulate
 
-SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
-MOWER, EIGHT = SAMPLES / "wheeled_lawnmower.mcap", SAMPLES / "wheeled_figure_eight"
+ROBOT = ("--robot", "husky-a200")
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -41,6 +40,11 @@ def run_directory(made: Path, run_place: Path) -> Path:
     directory = run_place / "icrtool-runs" / "barn"
     shutil.copytree(made, directory)
     return directory
+
+
+@pytest.fixture
+def field(short_logs: Path) -> Path:
+    return short_logs / "field.mcap"
 
 
 def spaced(page: str) -> str:
@@ -104,53 +108,54 @@ def test_what_is_no_result_has_no_page(icrtool: Command, place: str) -> None:
     assert errors.startswith(f"Error: {place}: no ")
 
 
-def test_report_of_a_log_answers_the_whole_question_and_fits_it_once(icrtool: Command, run_place: Path) -> None:
-    status, first, errors = icrtool("report", MOWER, "--robot", "segway-rmp400")
+def test_report_of_a_log_answers_the_whole_question_and_fits_it_once(
+    icrtool: Command, run_place: Path, field: Path
+) -> None:
+    status, first, errors = icrtool("report", field, *ROBOT)
     assert (status, errors) == (0, "")
     labels = [line.partition(" ")[0] for line in first.splitlines()]
     for label in ("controller", "Trust?", "Worst", "page"):
         assert label in labels
     assert "How far without GNSS?" in first
     assert "wheel_separation_multiplier" in first
-    run = run_place / "icrtool-runs" / MOWER.stem
+    run = run_place / "icrtool-runs" / field.stem
     assert str(run.relative_to(run_place) / "report.html") in first
     fitted, made = (run / "run.json").stat(), (run / "report.html").stat()
     # The run is there: only the test is made again, with the same answer.
-    assert icrtool("report", MOWER, "--robot", "segway-rmp400") == (0, first, "")
+    assert icrtool("report", field, *ROBOT) == (0, first, "")
     assert (run / "run.json").stat().st_mtime_ns == fitted.st_mtime_ns
     assert (run / "report.html").stat().st_mtime_ns > made.st_mtime_ns
-    status, second, _ = icrtool("report", MOWER, "--robot", "segway-rmp400", "-o", "mine.html", "--no-coordinates")
+    status, second, _ = icrtool("report", field, *ROBOT, "-o", "mine.html", "--no-coordinates")
     assert status == 0
     assert "written to mine.html" in second
     assert "left out" in Path("mine.html").read_text(encoding="utf-8")
 
 
-def test_a_run_of_other_settings_is_lost_only_with_overwrite(icrtool: Command, run_place: Path) -> None:
-    assert icrtool("fit", MOWER, "--robot", "segway-rmp400", "--plots", "none", "-q")[0] == 0
-    file = run_place / "icrtool-runs" / MOWER.stem / "run.json"
+def test_a_run_of_other_settings_is_lost_only_with_overwrite(icrtool: Command, run_place: Path, field: Path) -> None:
+    assert icrtool("fit", field, *ROBOT, "--plots", "none", "-q")[0] == 0
+    file = run_place / "icrtool-runs" / field.stem / "run.json"
     kept = file.read_bytes()
-    for command in (("fit", MOWER), ("report", MOWER), ("dropout-report", MOWER),
-                    ("fit", MOWER, "--robot", "segway-rmp400", "--from", "20")):  # fmt: skip
+    for command in (("fit", field), ("report", field), ("dropout-report", field),
+                    ("fit", field, *ROBOT, "--from", "20")):  # fmt: skip
         status, _, errors = icrtool(*command)
         assert status == 1
         assert "--overwrite" in errors
-        assert ("robot.name was segway-rmp400, now not given" in errors) == ("--from" not in command)
+        assert ("robot.name was husky-a200, now not given" in errors) == ("--from" not in command)
         assert ("--from was not given, now 20" in errors) == ("--from" in command)
         assert file.read_bytes() == kept
     # The same settings again, in other words, and what is no setting of a fit.
     words = ("--set", "dropout.horizons_m=[1, 2]", "--smooth", "--plots", "none", "-q")
-    assert icrtool("fit", MOWER, "--robot", "segway-rmp400", *words)[0] == 0
-    assert icrtool("fit", MOWER, "--overwrite", "--plots", "none", "-q")[0] == 0
+    assert icrtool("fit", field, *ROBOT, *words)[0] == 0
+    assert icrtool("fit", field, "--overwrite", "--plots", "none", "-q")[0] == 0
     assert json.loads(file.read_bytes())["config"]["robot"]["name"] is None
 
 
 @pytest.fixture
-def eight(icrtool: Command, run_place: Path) -> Path:
+def other(icrtool: Command, run_place: Path, short_logs: Path) -> Path:
     """A calibration of another log than the one that is reported on."""
-    robot = ("--robot", "segway-rmp400")
-    assert icrtool("fit", EIGHT, *robot, "-o", "eight", "--plots", "none", "-q")[0] == 0
-    assert icrtool("calibrate", "eight", "-o", "eight.json", "-q")[0] == 0
-    return run_place / "eight.json"
+    assert icrtool("fit", short_logs / "third", *ROBOT, "-o", "other", "--plots", "none", "-q")[0] == 0
+    assert icrtool("calibrate", "other", "-o", "other.json", "-q")[0] == 0
+    return run_place / "other.json"
 
 
 def calibration_rows(run: Path) -> list[dict[str, object]]:
@@ -162,9 +167,9 @@ def calibration_rows(run: Path) -> list[dict[str, object]]:
 
 @pytest.mark.parametrize("further", [(), ("--refit-sensors",)])
 def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_has(
-    icrtool: Command, run_place: Path, eight: Path, further: tuple[str, ...]
+    icrtool: Command, run_place: Path, field: Path, other: Path, further: tuple[str, ...]
 ) -> None:
-    asked = (MOWER, "--robot", "segway-rmp400", "--calibration", eight.name, *further)
+    asked = (field, *ROBOT, "--calibration", other.name, *further)
     assert icrtool("dropout-report", *asked, "--plots", "none", "-o", "expected", "-q")[0] == 0
     expected = calibration_rows(run_place / "expected")
     assert [one["name"] for one in expected if "by_horizon" in one][:1] == ["calibration"]
@@ -172,14 +177,14 @@ def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_ha
 
     status, shown, errors = icrtool("report", *asked)
     assert (status, errors) == (0, "")
-    run = run_place / "icrtool-runs" / MOWER.stem
+    run = run_place / "icrtool-runs" / field.stem
     assert calibration_rows(run) == expected
     assert "calibration" in [line.split()[0] for line in shown.splitlines() if line.strip()]
     assert "not fitted to this log" in spaced((run / "report.html").read_text(encoding="utf-8"))
 
     status, shown, errors = icrtool("batch", *asked, "--plots", "none", "-o", "results", "-j", "1")
     assert (status, errors) == (0, "")
-    assert calibration_rows(run_place / "results" / "runs" / MOWER.stem) == expected
+    assert calibration_rows(run_place / "results" / "runs" / field.stem) == expected
     assert "calibration_p95_10m_m" in (run_place / "results" / "fleet.csv").read_text(encoding="utf-8")
 
 
@@ -188,12 +193,12 @@ def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_ha
     ("content", "why"), [(None, "cannot be read"), ("{", "not a calibration"), ('{"schema": 1}', "not a calibration")]
 )
 def test_a_calibration_that_cannot_be_used_is_refused_before_any_log_is_read(
-    icrtool: Command, run_place: Path, command: tuple[str, ...], content: str | None, why: str
+    icrtool: Command, run_place: Path, field: Path, command: tuple[str, ...], content: str | None, why: str
 ) -> None:
     if content is not None:
         (run_place / "cal.json").write_text(content, encoding="utf-8")
     before = sorted(run_place.iterdir())
-    status, shown, errors = icrtool(*command, MOWER, "--robot", "segway-rmp400", "--calibration", "cal.json")
+    status, shown, errors = icrtool(*command, field, *ROBOT, "--calibration", "cal.json")
     assert (status, shown) == (1, "")
     assert errors.startswith("Error: cal.json: ")
     assert why in errors
@@ -202,18 +207,18 @@ def test_a_calibration_that_cannot_be_used_is_refused_before_any_log_is_read(
 
 @pytest.mark.parametrize("command", [("report",), ("batch", "-o", "results")])
 def test_sensors_are_refitted_only_for_a_calibration(
-    icrtool: Command, run_place: Path, command: tuple[str, ...]
+    icrtool: Command, run_place: Path, field: Path, command: tuple[str, ...]
 ) -> None:
-    status, _, errors = icrtool(*command, MOWER, "--refit-sensors")
+    status, _, errors = icrtool(*command, field, "--refit-sensors")
     assert status == 2
     assert "name one with --calibration" in errors
     assert list(run_place.iterdir()) == []
 
 
 def test_a_calibration_is_refused_for_the_page_of_a_finished_run(
-    icrtool: Command, run_directory: Path, eight: Path
+    icrtool: Command, run_directory: Path, other: Path
 ) -> None:
-    status, _, errors = icrtool("report", run_directory, "--calibration", eight)
+    status, _, errors = icrtool("report", run_directory, "--calibration", other)
     assert status == 1
     assert "is not a log" in errors
     assert "icrtool dropout-report RUN --calibration" in errors
@@ -254,8 +259,9 @@ def test_a_calibration_has_a_page(icrtool: Command, run_directory: Path) -> None
 
 def test_compare_begins_with_a_sentence_and_expands_patterns(icrtool: Command, run_place: Path) -> None:
     robot = ("--robot", "segway-rmp400")
+    rates = ("--wheel-rate", "20", "--heading-rate", "20", "--gnss-rate", "5")
     for name, seed in (("a1", 1), ("a2", 2), ("b1", 3)):
-        drive = ("--path", "curved", "--duration", "200", "--seed", seed, "-q")
+        drive = ("--path", "curved", "--duration", "200", "--seed", seed, "-q", *rates)
         assert icrtool("simulate", "-o", f"{name}.mcap", *drive, *robot)[0] == 0
     status, output, errors = icrtool(
         "compare", "before=a*.mcap", f"after={run_place}/b*.mcap", *robot, "-o", "both.json"

@@ -36,6 +36,7 @@ from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.recording_files import log_name
 from icrtool.logs.csv_table import csv_frame
 from icrtool.logs.read_log import read_log
+from icrtool.pipeline import fit
 
 SAMPLES = Path(__file__).parents[3] / "sample_logs"
 MCAP, BAG, DIRECTORY = (
@@ -84,9 +85,10 @@ def content(path: Path) -> tuple[list[tuple[str, int, bytes]], list[str]]:
         container.close()
 
 
-@pytest.mark.parametrize("log", [MCAP, BAG, DB3], ids=lambda log: log.suffix)
+@pytest.mark.parametrize("name", ["field.mcap", "other.bag", "third/third.db3"])
 @pytest.mark.parametrize("packing", PACKERS)
-def test_a_compressed_log_is_read_as_what_is_in_it(tmp_path, log, packing):
+def test_a_compressed_log_is_read_as_what_is_in_it(tmp_path, short_logs, name, packing):
+    log = short_logs / name
     path = tmp_path / f"{log.name}{packing}"
     half = len(log.read_bytes()) // 2
     # Two parts that follow one another, as parallel compressors write them.
@@ -95,8 +97,9 @@ def test_a_compressed_log_is_read_as_what_is_in_it(tmp_path, log, packing):
 
 
 @pytest.mark.parametrize("ending", MODES)
-@pytest.mark.parametrize("log", [MCAP, DIRECTORY], ids=["file", "directory"])
-def test_a_log_or_bag_directory_in_a_tar_archive_is_read(tmp_path, log, ending):
+@pytest.mark.parametrize("name", ["field.mcap", "third"])
+def test_a_log_or_bag_directory_in_a_tar_archive_is_read(tmp_path, short_logs, name, ending):
+    log = short_logs / name
     path = tmp_path / f"x{ending}"
     with tar_file(path, ending) as archive:
         archive.add(log, f"season/2026/{log.name}")
@@ -105,33 +108,34 @@ def test_a_log_or_bag_directory_in_a_tar_archive_is_read(tmp_path, log, ending):
 
 
 @pytest.mark.parametrize("layout", [tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
-def test_names_and_links_of_every_kind_of_tar_archive_are_understood(tmp_path, layout):
+def test_names_and_links_of_every_kind_of_tar_archive_are_understood(tmp_path, short_logs, layout):
     path, deep = tmp_path / "x.tar", "/".join(["a_folder_of_a_season"] * 6)
     name = f"{deep}/{'ä' if layout != tarfile.USTAR_FORMAT else 'a'}.mcap"
     with tarfile.open(path, "w", format=layout) as archive:
         link = tarfile.TarInfo("link.mcap")
         link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
         archive.addfile(link)
-        archive.add(MCAP, name)
-    assert content(path) == content(MCAP)
+        archive.add(short_logs / "field.mcap", name)
+    assert content(path) == content(short_logs / "field.mcap")
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
-def test_a_log_in_a_zip_archive_is_read_compressed_again_or_not(tmp_path, method):
-    for name, data in (("a.mcap", MCAP.read_bytes()), ("a.mcap.zst", zstandard.compress(MCAP.read_bytes()))):
+def test_a_log_in_a_zip_archive_is_read_compressed_again_or_not(tmp_path, short_logs, method):
+    log = (short_logs / "field.mcap").read_bytes()
+    for name, data in (("a.mcap", log), ("a.mcap.zst", zstandard.compress(log))):
         path = tmp_path / f"{name}.zip"
         with zipfile.ZipFile(path, "w", method) as archive:
             archive.writestr("season/", "")
             archive.writestr(f"season/{name}", data)
             archive.writestr("season/__MACOSX/._a.mcap", b"x")
-        assert content(path) == content(MCAP)
+        assert content(path) == content(short_logs / "field.mcap")
 
 
-def test_an_entry_without_a_name_in_a_zip_archive_costs_no_other_entry(tmp_path):
+def test_an_entry_without_a_name_in_a_zip_archive_costs_no_other_entry(tmp_path, short_logs):
     path = tmp_path / "nameless.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("x", b"no log")
-        archive.writestr("a.mcap", MCAP.read_bytes())
+        archive.writestr("a.mcap", (short_logs / "field.mcap").read_bytes())
     data = bytearray(path.read_bytes())
     for mark, at in ((b"PK\x03\x04", 26), (b"PK\x01\x02", 28)):
         # the name becomes a further field of one byte
@@ -139,7 +143,7 @@ def test_an_entry_without_a_name_in_a_zip_archive_costs_no_other_entry(tmp_path)
         data[place : place + 4] = b"\x00\x00\x01\x00"
     path.write_bytes(data)
     assert zipfile.ZipFile(path).namelist() == ["", "a.mcap"]
-    assert content(path) == content(MCAP)
+    assert content(path) == content(short_logs / "field.mcap")
 
 
 def test_a_bag_directory_whose_files_are_compressed_is_read_from_an_archive(tmp_path):
@@ -154,9 +158,9 @@ def test_a_bag_directory_whose_files_are_compressed_is_read_from_an_archive(tmp_
     assert content(path) == content(DIRECTORY)
 
 
-def test_the_sum_of_a_packed_log_is_that_of_the_file_that_was_named(tmp_path):
+def test_the_sum_of_a_packed_log_is_that_of_the_file_that_was_named(tmp_path, short_logs):
     path = tmp_path / "a.mcap.gz"
-    path.write_bytes(gzip.compress(MCAP.read_bytes()))
+    path.write_bytes(gzip.compress((short_logs / "field.mcap").read_bytes()))
     container = open_log(path)
     (found,) = container.inputs(Event())
     container.close()
@@ -364,18 +368,19 @@ def append(file: Path) -> None:
         stream.write(b"\0")
 
 
-@pytest.mark.parametrize("log", [MCAP, BAG, DB3, DIRECTORY, "a.mcap.gz"])
-def test_a_log_that_is_written_to_while_it_is_read_is_refused(tmp_path, log):
-    if log == "a.mcap.gz":
-        place = file = tmp_path / log
-        file.write_bytes(gzip.compress(MCAP.read_bytes()))
+@pytest.mark.parametrize("name", ["field.mcap", "other.bag", "third/third.db3", "third", "a.mcap.gz"])
+def test_a_log_that_is_written_to_while_it_is_read_is_refused(tmp_path, short_logs, name):
+    log, config = short_logs / name, load_config(robot="husky-a200")
+    if name == "a.mcap.gz":
+        place = file = tmp_path / name
+        file.write_bytes(gzip.compress((short_logs / "field.mcap").read_bytes()))
     else:
         place = tmp_path / log.name
         (shutil.copytree if log.is_dir() else shutil.copy)(log, place)
-        file = place / DB3.name if log.is_dir() else place
-    assert len(read_log(place, CONFIG).wheels.stamp_ns)
+        file = place / "third.db3" if log.is_dir() else place
+    assert len(read_log(place, config).wheels.stamp_ns)
     with pytest.raises(LogChangedError, match="changed while it was read"):
-        read_log(place, CONFIG, progress=lambda share: append(file))
+        read_log(place, config, progress=lambda share: append(file))
 
 
 def test_a_table_that_is_written_to_while_it_is_read_is_refused(tmp_path, monkeypatch):
@@ -392,19 +397,15 @@ def test_a_table_that_is_written_to_while_it_is_read_is_refused(tmp_path, monkey
         read_log(file)
 
 
-def test_standard_input_gives_the_numbers_of_the_file(tmp_path, temporary):
-    data = gzip.compress(MCAP.read_bytes())
+def test_standard_input_gives_the_numbers_of_the_file(tmp_path, temporary, short_logs):
+    log, robot = short_logs / "field.mcap", "husky-a200"
+    data = gzip.compress(log.read_bytes())
     piped = command(
-        *("fit", "-", "--robot", "segway-rmp400", "--plots", "none"),
-        temporary=temporary, stdin=subprocess.PIPE, cwd=tmp_path,
-    )  # fmt: skip
+        *("fit", "-", "--robot", robot, "--plots", "none"), temporary=temporary, stdin=subprocess.PIPE, cwd=tmp_path
+    )
     _, said = piped.communicate(data, timeout=120)
     assert piped.returncode == 0, said
-    named = command(
-        *("fit", str(MCAP), "--robot", "segway-rmp400", "--plots", "none", "-o", "named"),
-        temporary=temporary, cwd=tmp_path,
-    )  # fmt: skip
-    named.communicate(timeout=120)
+    fit(read_log(log, load_config(robot=robot)), load_config(robot=robot)).write(tmp_path / "named", plots=())
     states = [(tmp_path / place / "states.csv").read_bytes() for place in ("icrtool-runs/stdin", "named")]
     assert states[0] == states[1]
     document = (tmp_path / "icrtool-runs/stdin/run.json").read_text()
