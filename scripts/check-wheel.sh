@@ -19,7 +19,7 @@ tools=$(dirname "$build_python")
 export UV_TOOL_DIR=$scratch/tools UV_TOOL_BIN_DIR=$scratch/bin UV_NO_CONFIG=1
 
 echo "check-wheel: build"
-"$build_python" -m build --outdir "$scratch/dist" . >"$scratch/build.log" 2>&1 || { cat "$scratch/build.log" >&2; exit 1; }
+"$build_python" -m build --installer uv --outdir "$scratch/dist" . >"$scratch/build.log" 2>&1 || { cat "$scratch/build.log" >&2; exit 1; }
 wheel=$(ls "$scratch"/dist/*.whl)
 "$build_python" -m twine check --strict "$scratch"/dist/* >"$scratch/twine.log" || { cat "$scratch/twine.log" >&2; exit 1; }
 # W002: the same message definition stands in two packages of messages.
