@@ -79,8 +79,8 @@ def test_a_dropout_report_writes_the_page_unless_it_is_not_wanted(icrtool: Comma
 def test_figures_all_adds_those_of_the_paper(icrtool: Command, run_directory: Path) -> None:
     drawn = {}
     for figures in ("default", "all"):
-        command = ("dropout-report", run_directory, "--plots", "svg", "--figures", figures, "--no-page", "-q")
-        assert icrtool(*command) == (0, "", "")
+        lean = ("--no-page", "--no-ladder", "-q")
+        assert icrtool("dropout-report", run_directory, "--plots", "svg", "--figures", figures, *lean) == (0, "", "")
         drawn[figures] = {file.stem for file in (run_directory / "dropout" / "plots").iterdir()}
     assert {"summary", "histogram", "worst"} <= drawn["default"]
     assert drawn["all"] - drawn["default"] == {"histogram_05m", "histogram_10m", "histogram_20m", "examples_15m"}
@@ -170,7 +170,7 @@ def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_ha
     icrtool: Command, run_place: Path, field: Path, other: Path, further: tuple[str, ...]
 ) -> None:
     asked = (field, *ROBOT, "--calibration", other.name, *further)
-    assert icrtool("dropout-report", *asked, "--plots", "none", "-o", "expected", "-q")[0] == 0
+    assert icrtool("dropout-report", *asked, "--plots", "none", "--no-page", "-o", "expected", "-q")[0] == 0
     expected = calibration_rows(run_place / "expected")
     assert [one["name"] for one in expected if "by_horizon" in one][:1] == ["calibration"]
     assert ("(--refit-sensors)" in str(expected)) == bool(further)
@@ -182,7 +182,7 @@ def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_ha
     assert "calibration" in [line.split()[0] for line in shown.splitlines() if line.strip()]
     assert "not fitted to this log" in spaced((run / "report.html").read_text(encoding="utf-8"))
 
-    status, shown, errors = icrtool("batch", *asked, "--plots", "none", "-o", "results", "-j", "1")
+    status, shown, errors = icrtool("batch", *asked, "--plots", "none", "--no-page", "-o", "results", "-j", "1")
     assert (status, errors) == (0, "")
     assert calibration_rows(run_place / "results" / "runs" / field.stem) == expected
     assert "calibration_p95_10m_m" in (run_place / "results" / "fleet.csv").read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ import pytest
 
 import icrtool
 from icrtool.errors import IcrToolError, LogError, MissingStreamError
-from icrtool.records.run import Run
+from support.shared_runs import run_of_log
 
 RUNS = {
     "simulated/wheeled_lawnmower": ("segway-rmp400", (0.74, -0.73, 0.02)),
@@ -23,15 +23,10 @@ ICR_TOLERANCE_M = 0.1
 """The ICRs of a real robot differ by ground and manoeuvre; half a decimetre either way is what the runs show."""
 
 
-def run_of(shared_logs: Path, name: str, robot: str) -> Run:
-    config = icrtool.load_config(robot=robot)
-    return icrtool.fit(icrtool.read_log(shared_logs / name, config), config)
-
-
 @pytest.mark.parametrize("name", RUNS)
 def test_the_learned_icrs_of_known_robots_are_where_they_should_be(shared_logs: Path, name: str) -> None:
     robot, expected = RUNS[name]
-    run = run_of(shared_logs, name, robot)
+    run = run_of_log(shared_logs / name, robot)
     final = run.summary["icr"]["final"]
     assert [final["y_icr_right_m"], final["y_icr_left_m"]] == pytest.approx(expected[:2], abs=ICR_TOLERANCE_M)
     assert final["x_icr_m"] == pytest.approx(expected[2], abs=ICR_TOLERANCE_M)
@@ -48,7 +43,7 @@ def test_the_learned_icrs_of_known_robots_are_where_they_should_be(shared_logs: 
 def test_recorded_logs_of_poor_quality_run_sanely_and_say_what_is_wrong(
     shared_logs: Path, name: str, robot: str
 ) -> None:
-    run = run_of(shared_logs, name, robot)
+    run = run_of_log(shared_logs / name, robot)
     assert run.warnings
     assert run.table.y_icr_right_m[-1] > 0 > run.table.y_icr_left_m[-1]
     assert np.hypot(run.table.north_m, run.table.east_m).max() < 300.0
@@ -56,7 +51,7 @@ def test_recorded_logs_of_poor_quality_run_sanely_and_say_what_is_wrong(
 
 
 def test_the_troubled_log_runs_finds_the_heading_offset_and_rejects_the_outliers(shared_logs: Path) -> None:
-    run = run_of(shared_logs, "simulated/tracked_trouble", "pentzer-tracked")
+    run = run_of_log(shared_logs / "simulated/tracked_trouble", "pentzer-tracked")
     assert run.summary["heading"]["applied_offset_deg"] == pytest.approx(12.0, abs=0.5)
     assert 40 <= run.summary["gnss"]["rejected_by_gate"] <= 70
     assert len(run.outages_ns) == 1
@@ -64,7 +59,7 @@ def test_the_troubled_log_runs_finds_the_heading_offset_and_rejects_the_outliers
 
 @pytest.mark.parametrize("name", ["tracked_curved.bag", "wheeled_lawnmower", "wheeled_circle"])
 def test_the_two_sigma_band_of_the_pose_holds_the_truth_nine_times_in_ten(shared_logs: Path, name: str) -> None:
-    run = run_of(shared_logs, f"simulated/{name}", RUNS[f"simulated/{name}"][0])
+    run = run_of_log(shared_logs / "simulated" / name, RUNS[f"simulated/{name}"][0])
     truth = np.load(shared_logs / "simulated" / f"{name}.truth.npz")
     t = (run.table.stamp_ns - 1_760_000_000_000_000_000) / 1e9
     settled = t > 30.0

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import icrtool
 from icrtool.calibration.run_models import models_of
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import SHORT, trial_ends
 from icrtool.records.run import track_of
+from support.shared_runs import run_of_log
 
 LOGS = {
     "real/warthog_grass.bag": "warthog",
@@ -34,14 +34,13 @@ LIDAR_JUMPS, CLEAN = (
 WITHIN_M = 2.5
 """At 10 m (95 %), of a robot whose wheels stand for its motion; two paths of 10 m cannot end more than 20 m apart."""
 
-MOST_STEPS = 4e6
+MOST_STEPS = 1e6
 """Steps of direct integration a model and log: above, every so many-th start is tried."""
 
 
 @pytest.mark.parametrize("name", LOGS)
 def test_every_error_equals_brute_force(shared_logs: Path, name: str) -> None:
-    config = icrtool.load_config(robot=LOGS[name])
-    run = icrtool.fit(icrtool.read_log(shared_logs / name, config), config)
+    run = run_of_log(shared_logs / name, LOGS[name])
     fast: dict[str, list[np.ndarray]] = {}
     report = dropout(run, starts="all", sink=lambda model, _, errors: fast.setdefault(model, []).append(errors.copy()))
     drive = track_of(run)
@@ -61,8 +60,7 @@ def test_every_error_equals_brute_force(shared_logs: Path, name: str) -> None:
 
 
 def test_lidar_poses_that_jump_by_metres_are_not_charged_to_the_robot(shared_logs: Path) -> None:
-    config = icrtool.load_config(robot=LOGS[LIDAR_JUMPS])
-    run = icrtool.fit(icrtool.read_log(shared_logs / LIDAR_JUMPS, config), config)
+    run = run_of_log(shared_logs / LIDAR_JUMPS, LOGS[LIDAR_JUMPS])
     decided = [jump for jump in run.sensors.jumps if not jump.undecided]
     assert max(jump.size_m for jump in decided) > 10.0
     report = dropout(run, [10.0])
@@ -75,6 +73,5 @@ def test_lidar_poses_that_jump_by_metres_are_not_charged_to_the_robot(shared_log
 
 @pytest.mark.parametrize("name", CLEAN)
 def test_references_without_jumps_keep_every_trial(shared_logs: Path, name: str) -> None:
-    config = icrtool.load_config(robot=LOGS[name])
-    run = icrtool.fit(icrtool.read_log(shared_logs / name, config), config)
+    run = run_of_log(shared_logs / name, LOGS[name])
     assert not run.jumping.any()

@@ -193,7 +193,7 @@ def test_where_an_address_is_not_taken_it_is_refused_without_its_secrets(monkeyp
      ("runs/one/run.json", "s3://field/runs/one", "not a run directory")],
 )  # fmt: skip
 def test_a_place_that_cannot_be_written_is_refused_before_the_log_is_read(
-    store, monkeypatch, capfd, there, place, why
+    store, monkeypatch, capfd, mcap, there, place, why
 ):  # fmt: skip
     store.client.put_object(Bucket="field", Key=there, Body=b"of a person")
     status, said = run(monkeypatch, capfd, "fit", "none.mcap", *ROBOT, "-o", place)
@@ -317,7 +317,7 @@ def test_of_two_commands_that_write_to_one_address_one_ends_with_an_error(store,
 
 @pytest.mark.parametrize("group", [0, 1, 2])
 def test_a_command_that_writes_while_another_uploads_changes_nothing_and_the_run_is_whole(
-    store, monkeypatch, capfd, group
+    store, monkeypatch, capfd, mcap, group
 ):
     """The other command begins and ends before each group of files of this one."""
     each, others, calls = remote_place._Store._each, [], []
@@ -326,11 +326,11 @@ def test_a_command_that_writes_while_another_uploads_changes_nothing_and_the_run
         if isinstance(request, functools.partial):
             calls.append(0)
             if len(calls) == group + 1:
-                others.append(fit_apart())
+                others.append(fit_apart(mcap))
         return each(self, request, files)
 
     monkeypatch.setattr(remote_place._Store, "_each", between)
-    status, said = run(monkeypatch, capfd, *FIT)
+    status, said = run(monkeypatch, capfd, *fit_command(mcap))
     assert status == 0, said
     assert others == [1]
     assert ".icrtool-writer" not in names(store, "runs/one/")
@@ -341,7 +341,7 @@ def test_a_command_that_writes_while_another_uploads_changes_nothing_and_the_run
         assert hashlib.blake2b(content(store, f"runs/one/{name}")).hexdigest() == digest
 
 
-def test_a_claim_of_a_living_command_is_named_and_one_of_a_dead_command_is_replaced(store, monkeypatch, capfd):
+def test_a_claim_of_a_living_command_is_named_and_one_of_a_dead_command_is_replaced(store, monkeypatch, capfd, mcap):
     here = writer().partition("-")[0]
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
@@ -356,7 +356,7 @@ def test_a_claim_of_a_living_command_is_named_and_one_of_a_dead_command_is_repla
     }
     for claim, words in claims.items():
         store.client.put_object(Bucket="field", Key="runs/one/.icrtool-writer", Body=claim.encode())
-        status, said = run(monkeypatch, capfd, *FIT, "--overwrite")
+        status, said = run(monkeypatch, capfd, *fit_command(mcap), "--overwrite")
         assert status == bool(words), said
         if words:
             assert f"s3://field/runs/one: another command {words}; its results stay" in said
@@ -365,7 +365,7 @@ def test_a_claim_of_a_living_command_is_named_and_one_of_a_dead_command_is_repla
             assert ".icrtool-writer" not in names(store, "runs/one/")
 
 
-def test_a_store_without_conditional_writes_is_written_all_the_same(store, monkeypatch, capfd):
+def test_a_store_without_conditional_writes_is_written_all_the_same(store, monkeypatch, capfd, mcap):
     import s3fs
 
     put = s3fs.S3FileSystem._pipe_file
@@ -376,12 +376,14 @@ def test_a_store_without_conditional_writes_is_written_all_the_same(store, monke
         return await put(self, path, data, *given, **named)
 
     monkeypatch.setattr(s3fs.S3FileSystem, "_pipe_file", without)
-    status, said = run(monkeypatch, capfd, *FIT)
+    status, said = run(monkeypatch, capfd, *fit_command(mcap))
     assert status == 0, said
-    assert len(icrtool.open_run("s3://field/runs/one").states) == 19_901
+    config = icrtool.load_config(robot=ROBOT[1])
+    expected = icrtool.fit(icrtool.read_log(mcap, config), config)
+    assert len(icrtool.open_run("s3://field/runs/one").states) == len(expected.states)
 
 
-def test_a_claim_that_another_command_took_after_an_hour_is_seen_between_files(store, monkeypatch, capfd):
+def test_a_claim_that_another_command_took_after_an_hour_is_seen_between_files(store, monkeypatch, capfd, mcap):
     put, seen = remote_place._Store._put_file, []
 
     def after_the_other(self, folder, claim, name):
@@ -392,7 +394,7 @@ def test_a_claim_that_another_command_took_after_an_hour_is_seen_between_files(s
         return put(self, folder, claim, name)
 
     monkeypatch.setattr(remote_place._Store, "_put_file", after_the_other)
-    status, said = run(monkeypatch, capfd, *FIT)
+    status, said = run(monkeypatch, capfd, *fit_command(mcap))
     assert status == 1
     assert "another command began to write there" in said
     assert "states.csv" not in names(store, "runs/one/")
