@@ -193,7 +193,7 @@ def test_where_an_address_is_not_taken_it_is_refused_without_its_secrets(monkeyp
      ("runs/one/run.json", "s3://field/runs/one", "not a run directory")],
 )  # fmt: skip
 def test_a_place_that_cannot_be_written_is_refused_before_the_log_is_read(
-    store, monkeypatch, capfd, mcap, there, place, why
+    store, monkeypatch, capfd, there, place, why
 ):  # fmt: skip
     store.client.put_object(Bucket="field", Key=there, Body=b"of a person")
     status, said = run(monkeypatch, capfd, "fit", "none.mcap", *ROBOT, "-o", place)
