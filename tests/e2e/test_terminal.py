@@ -234,22 +234,22 @@ def test_the_next_command_of_an_unusable_run_names_the_log_and_the_options(scree
     assert command == ["icrtool", "info", "two words.mcap", "-v", *given]
 
 
-def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Screen, short_logs: Path) -> None:
-    logs, robot = [short_logs / name for name in ("field.mcap", "other.bag")], ("--robot", "husky-a200")
-    status, lines = screen("calibrate", *logs, *robot)
+def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Screen) -> None:
+    logs = [ROOT / "sample_logs" / name for name in ("wheeled_lawnmower.mcap", "wheeled_figure_eight")]
+    status, lines = screen("calibrate", *logs, *ROBOT)
     check_fits(lines)
     assert status == 0
     assert "wheel_separation_multiplier" in "\n".join(lines)
     assert "How far within 0.5 m (95 %), each log left out in turn?" in lines
     assert "omega_sw" not in "\n".join(lines)
-    status, brief = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *robot)
+    status, brief = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *ROBOT)
     check_fits(brief)
     text = " ".join("\n".join(brief).split())
     assert status == 0
     assert text.startswith("b against a: no difference of the error found; with these 2 drives a change below")
     assert "The multiplier of b differs from the multiplier of a by" in text
     assert "error [m] after 10 m, calibrated on row, tested on column" in text
-    full = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *robot, "-v")[1]
+    full = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *ROBOT, "-v")[1]
     assert len(full) > len(brief) + 8
 
 
