@@ -35,7 +35,8 @@ NOT_RUN = {
 }
 FEWER = {
     "study": ["--runs", "2", "--duration", "20"], "simulate": ["--duration", "60"],
-    "fit": ["--plots", "none"], "dropout-report": ["--plots", "none"], "batch": ["--plots", "none", "--no-ladder"],
+    "fit": ["--plots", "none"], "dropout-report": ["--plots", "none", "--no-page"],
+    "batch": ["--plots", "none", "--no-ladder", "--no-page"],
 }  # fmt: skip
 """Options added so that a command takes a second, not minutes; pictures are drawn by the tests of each command."""
 

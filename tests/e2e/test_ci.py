@@ -42,7 +42,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         gated, baseline, one_log = (shlex.split(command) for command in COMMANDS)
         written = ("--junit", "gates.xml", "--markdown", "summary.md")
         for command in (baseline, [*gated, *LIMIT, *written], one_log):
-            assert call(patch, *command, "-q", "--plots", "none") == 0, command
+            assert call(patch, *command, "-q", "--plots", "none", "--no-page") == 0, command
     return place
 
 
