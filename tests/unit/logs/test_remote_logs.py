@@ -210,7 +210,7 @@ def test_of_a_bag_directory_of_mcap_files_only_the_bytes_that_are_needed_are_rea
     folder.mkdir()
     names = [f"drive_{number}.mcap" for number in range(3)]
     for name in names:
-        drive(folder / name, size=8_000_000, **LAYOUTS["own chunks"])
+        drive(folder / name, size=20_000_000, **LAYOUTS["own chunks"])
     metadata = f"rosbag2_bagfile_information:\n  relative_file_paths: [{', '.join(names)}]\n"
     (folder / "metadata.yaml").write_text(metadata)
     size = sum(file.stat().st_size for file in folder.iterdir())
