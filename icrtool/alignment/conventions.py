@@ -265,12 +265,18 @@ def _cost(convention: Convention, fit: _Shown) -> tuple[float, float]:
     return cost, math.remainder(offset * convention.position, 2 * math.pi)
 
 
-def convention_notes(decision: Decision, *, corrects: bool) -> list[Note]:
-    """Return findings on which sides or senses are not as named; the heading's own is reported with its offset."""
+def convention_notes(decision: Decision, *, corrects: bool, mirrored: bool = False) -> list[Note]:
+    """Return findings on which sides or senses are not as named; the heading's own is reported with its offset.
+
+    `mirrored`: no gyro and no heading of the log tells swapped sides from mirrored positions.
+    """
     convention, alternative, done = decision.convention, decision.as_likely, ": corrected" if corrects else ""
     notes = []
     if convention.swapped:
-        notes.append(note("sides_swapped", f"left and right wheels are swapped{done}"))
+        alike = (
+            "; or the sign of a latitude or longitude is wrong, or both are exchanged: no gyro or heading tells which"
+        )
+        notes.append(note("sides_swapped", f"left and right wheels are swapped{done}{alike if mirrored else ''}"))
     signs = (convention.sign_left, convention.sign_right)
     reversed_ = {(-1, 1): "the left wheels", (1, -1): "the right wheels", (-1, -1): "both wheels"}
     if signs in reversed_:

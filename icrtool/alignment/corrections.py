@@ -287,6 +287,7 @@ def _name_streams(
     faults = dead_or_copied(log)
     windows = windows_of_log(log, width_m, None if derived is None else derived.smoothed)
     free = config.frames.heading == "auto" and derived is None
+    alone = derived is not None and log.gyro is None and not log.gyros
     decision = decide_conventions(
         windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, windows.track), mirror_allowed=free
     )
@@ -299,8 +300,8 @@ def _name_streams(
         windows = windows_of_log(named, width_m, None if derived is None else derived.smoothed)
     notes = [
         *faults,
-        *convention_notes(Decision(senses, None), corrects=True),
-        *convention_notes(decision, corrects=corrects),
+        *convention_notes(Decision(senses, None), corrects=True, mirrored=alone),
+        *convention_notes(decision, corrects=corrects, mirrored=alone),
     ]
     if derived is None and config.frames.heading != "auto":
         free_hand = decide_conventions(windows, metric=False)

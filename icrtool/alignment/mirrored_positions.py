@@ -12,7 +12,7 @@ from icrtool.alignment.clock_search import with_configured_delays
 from icrtool.alignment.conventions import DECISIVE, NamedFit, gyro_sense
 from icrtool.alignment.log_track import FEWEST_OVERLAPPING, check_streams, windows_of_log
 from icrtool.alignment.turn_rates import Z_UP
-from icrtool.alignment.wheel_units import with_wheel_speeds
+from icrtool.alignment.wheel_units import reference_scale, with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import trapezoids, wrapped
@@ -36,16 +36,19 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
 
     Gyro, heading and wheels are three witnesses of the sense in which the robot turns. Where they agree, and the course
     over ground turns in the other sense, the positions are mirrored. In a log without a heading, gyro and wheels are
-    the witnesses; two faults, an exchanged pair of sides and a gyro upside down, would look the same. Metric positions
-    with a heading are left to `icrtool.alignment.conventions`. Preset ``paper`` corrects nothing.
+    the witnesses; two faults, an exchanged pair of sides and a gyro upside down, would look the same. In a log without
+    a gyro, the distances of the wheels show an exchange of latitude and longitude. Metric positions with a heading are
+    left to `icrtool.alignment.conventions`. Preset ``paper`` corrects nothing.
     """
     by_gyro = not len(log.heading.stamp_ns)
-    if not config.filter.rules.corrects or (not by_gyro and (log.datum is None or log.gyro is None)):
+    if not config.filter.rules.corrects or (not by_gyro and log.datum is None):
         return log
     width = width_or_usual_m(config.robot.track_width_m)
     moved, inner, _ = with_configured_delays(log, config)
     try:
         with_speeds = with_wheel_speeds(moved, inner)
+        if log.gyro is None and not log.gyros:
+            return _exchanged_by_distance(log, with_speeds)
         if by_gyro:
             with_speeds = _with_turned_heading(with_speeds)
         check_streams(with_speeds)
@@ -53,10 +56,13 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
         # it is refused later, with its reason
         return log
     windows = windows_of_log(with_speeds, width)
-    if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
-        return log
-    as_sent = NamedFit.of(windows)
-    if as_sent.turn_sigmas < WITNESS_SIGMAS or (not by_gyro and gyro_sense(with_speeds, windows.track) <= 0):
+    enough = min(len(windows.begin), len(windows.turn_begin)) >= FEWEST_OVERLAPPING
+    as_sent = NamedFit.of(windows) if enough else None
+    if (
+        as_sent is None
+        or as_sent.turn_sigmas < WITNESS_SIGMAS
+        or not (by_gyro or gyro_sense(with_speeds, windows.track) > 0)
+    ):
         return log
     candidates = []
     for words, one in _exchanges(log):
@@ -84,6 +90,37 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
         f"(twice the gain in log-likelihood {gain:.0f}, decisive from {DECISIVE:.0f} on)"
     )
     return replace(right, notes=(*right.notes, note("positions_mirrored", why, log.name)))
+
+
+def _exchanged_by_distance(log: RobotLog, named: RobotLog) -> RobotLog:
+    """Return the log with latitude and longitude exchanged where its distances then fit the wheels; else the log.
+
+    A degree of latitude and a degree of longitude have other lengths: where they are exchanged, the distance of the
+    positions per distance of the wheels varies with the direction. Of two scatters s of n spans, twice the gain in
+    log-likelihood is 2 n log(s_1/s_2).
+
+    Parameters
+    ----------
+    named : the same log with wheel speeds
+    """
+    other = None if log.datum is None else _both_exchanged(log, log.datum)
+    if other is None:
+        return log
+    wheels = named.wheels
+    sent, back = (
+        reference_scale(wheels.stamp_ns, wheels.v_left_mps, wheels.v_right_mps, one.gnss) for one in (named, other)
+    )
+    if sent is None or back is None or not min(sent.value, sent.std, back.value, back.std) > 0.0:
+        return log
+    ratio = (sent.std / sent.value * math.sqrt(sent.spans)) / (back.std / back.value * math.sqrt(back.spans))
+    gain = 2.0 * min(sent.spans, back.spans) * math.log(ratio)
+    if not gain > DECISIVE:
+        return log
+    why = (
+        "the distances of the positions fit the wheels' in all directions where latitude and longitude are exchanged: "
+        f"corrected (twice the gain in log-likelihood {gain:.0f}, decisive from {DECISIVE:.0f} on)"
+    )
+    return replace(other, notes=(*other.notes, note("positions_mirrored", why, log.name)))
 
 
 def _with_turned_heading(log: RobotLog) -> RobotLog:

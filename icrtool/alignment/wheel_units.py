@@ -74,10 +74,11 @@ which the robot does not move."""
 
 
 class Scale(NamedTuple):
-    """Metres by the position reference per unit of the wheels: median, and its standard deviation."""
+    """Metres by the position reference per unit of the wheels: median, its standard deviation, number of spans."""
 
     value: float
     std: float
+    spans: int = 0
 
 
 def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
@@ -292,7 +293,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
         return None
     ratio = chord[straight] / distance[straight]
     centre = float(np.median(ratio))
-    return Scale(centre, 1.2533 * mad_std(ratio) / math.sqrt(len(ratio)))
+    return Scale(centre, 1.2533 * mad_std(ratio) / math.sqrt(len(ratio)), len(ratio))
 
 
 def _metres_per_unit(

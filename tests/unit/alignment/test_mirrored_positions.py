@@ -192,3 +192,22 @@ def test_without_a_heading_right_positions_are_left_as_they_are(bias_radps: floa
     # gyro and wheels must agree: a gyro upside down is no witness
     mirrored = read_as(without_heading(log_of(), sense=-1), longitude=-1)
     assert with_right_positions(mirrored, CONFIG) is mirrored
+
+
+@pytest.mark.parametrize("heading", [True, False])
+@pytest.mark.parametrize("seed", [5, 6])
+def test_without_a_gyro_distances_show_that_latitude_and_longitude_are_exchanged(heading: bool, seed: int) -> None:
+    log = log_of(gyro=False, seed=seed)
+    log = log if heading else replace(log, heading=NO_HEADINGS)
+    found = with_right_positions(read_as(log, exchanged=True), CONFIG)
+    np.testing.assert_allclose(found.gnss.north_m, log.gnss.north_m, atol=2e-3)
+    np.testing.assert_allclose(found.gnss.east_m, log.gnss.east_m, atol=2e-3)
+    assert [one.code for one in found.notes] == ["positions_mirrored"]
+    # where they are right, an exchange fits worse
+    assert with_right_positions(log, CONFIG) is log
+
+
+def test_without_gyro_and_heading_swapped_sides_and_mirrored_positions_are_both_named() -> None:
+    run = fit(replace(read_as(log_of(gyro=False), longitude=-1), heading=NO_HEADINGS), CONFIG)
+    (text,) = [one.text for one in run.document.notes if one.code == "sides_swapped"]
+    assert "latitude or longitude" in text
