@@ -268,13 +268,13 @@ def _cost(convention: Convention, fit: _Shown) -> tuple[float, float]:
 def convention_notes(decision: Decision, *, corrects: bool, mirrored: bool = False) -> list[Note]:
     """Return findings on which sides or senses are not as named; the heading's own is reported with its offset.
 
-    `mirrored`: no gyro and no heading of the log tells swapped sides from mirrored positions.
+    `mirrored`: the log has no gyro and no heading, so that swapped sides and mirrored positions look alike.
     """
     convention, alternative, done = decision.convention, decision.as_likely, ": corrected" if corrects else ""
     notes = []
     if convention.swapped:
         alike = (
-            "; or the sign of a latitude or longitude is wrong, or both are exchanged: no gyro or heading tells which"
+            "; or the sign of a latitude or longitude is wrong, or both are exchanged: no gyro or heading shows which"
         )
         notes.append(note("sides_swapped", f"left and right wheels are swapped{done}{alike if mirrored else ''}"))
     signs = (convention.sign_left, convention.sign_right)

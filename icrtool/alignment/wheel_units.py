@@ -307,7 +307,8 @@ def _metres_per_unit(
         if counts is not None:
             metres_by_unit["counts"] = 2 * math.pi * radius / counts
     unit, per = wheels.unit, "" if wheels.from_position else "/s"
-    if unit == "rad" and radius is not None and not wheels.from_position and config.wheels.unit == "auto":
+    nothing_given = config.wheels.unit == config.wheels.left_scale == config.wheels.right_scale == "auto"
+    if unit == "rad" and radius is not None and not wheels.from_position and nothing_given:
         scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
         far = scale is not None and scale.value > 0.0 and abs(math.log(scale.value / radius)) >= 2 * UNIT_TOLERANCE
         # the units in which drivers fill speeds of joints

@@ -41,8 +41,20 @@ def fitted(path: Path, *sets: str) -> Run:
         (1.3, ()),
         (2.0, ("wheels.left_scale=0.5", "wheels.right_scale=0.5")),
         (0.3, ("wheels.left_scale=3.3333", "wheels.right_scale=3.3333")),
+        # a tenth is nearly the factor from rpm to rad/s
+        (10.0, ("wheels.left_scale=0.1", "wheels.right_scale=0.1", "wheels.quantity=velocity")),
     ],
-    ids=["twice", "half", "three times", "a tenth", "ten times", "1.3 times", "configured half", "configured third"],
+    ids=[
+        "twice",
+        "half",
+        "three times",
+        "a tenth",
+        "ten times",
+        "1.3 times",
+        "configured half",
+        "configured third",
+        "configured tenth",
+    ],
 )
 def test_every_row_sees_wheels_that_were_corrected(path: Path, radius: float, sets: tuple[str, ...]) -> None:
     run = fitted(path, f"robot.wheel_radius_m={radius * RADIUS_M}", *sets)
