@@ -15,6 +15,11 @@ with its numbers. `run.json`, `report.json`, `fleet.json`, calibration files, `i
 hold them as `notes`; `warnings` lists their texts for people. Codes do not change with the wording: scripts compare
 codes. `fleet.csv` has the codes of each log in the column `notes`, separated by `;`.
 
+A command prints the text of a note, not its code. To find a printed warning on this page, search for its words under
+*Found*, or print the codes beside the texts:
+
+    icrtool fit field.mcap --robot husky-a200 --json | jq -r '.logs[0].run.notes[] | .code + ": " + .text'
+
 | grade | meaning |
 |---|---|
 | `info` | Corrected, or of little consequence. Nothing needs to be done. |

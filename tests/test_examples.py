@@ -41,7 +41,8 @@ def test_the_notebook_runs_and_its_calibration_predicts_the_other_log(monkeypatc
     assert stored == pytest.approx(rows.to_numpy(), rel=0.02, abs=0.003)
     explained = "".join(cells[place + 1]["source"])
     assert all(
-        f"{stored[2, list(rows.columns).index(name)]:.3f} m" in explained for name in ("calibration", "icr_final")
+        f"{stored[2, list(rows.columns).index(name)]:.3f} m" in explained
+        for name in ("calibration", "calibration_gyro", "icr_final")
     )
     # The two ways to predict the other log agree on what the calibration is worth there.
     states = names["other"].states

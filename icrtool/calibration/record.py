@@ -22,6 +22,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.adaptive import TermsPrior
 from icrtool.motion.models import (
     FIVE,
+    MODELS,
     NO_SLIP,
     RECOMMENDED,
     TERMS,
@@ -367,10 +368,15 @@ def unfit_reasons(calibration: Calibration) -> tuple[Note, ...]:
     return tuple(reasons)
 
 
-def export_notes(calibration: Calibration) -> tuple[Note, ...]:
-    """Return the notes that a user needs before a controller uses a calibration."""
+def export_notes(calibration: Calibration, model: str = RECOMMENDED) -> tuple[Note, ...]:
+    """Return the notes that a user needs before a calibration is used.
+
+    Parameters
+    ----------
+    model : whose terms are used: a controller has no parameter for the last three of `RECOMMENDED`
+    """
     reasons = [one for one in unfit_reasons(calibration) if one not in calibration.notes]
-    for name in calibration.fitted.not_shown:
+    for name in (name for name in calibration.fitted.not_shown if name in MODELS[model].terms):
         why = f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
         reasons.append(note("parameter_not_shown", why))
     if (multiplier := calibration.controller.multiplier) < 1.0:

@@ -125,16 +125,14 @@ def _verdict(
     """Return one sentence: how the multiplier differs, and what the first calibration adds to the second's errors."""
     one = next(one for one in parameters if one.quantity == "multiplier")
     change = with_std(one.difference, one.std)
-    differs = f"The multiplier of {second} differs from the multiplier of {first} by {change}"
-    if not one.significant:
-        differs = f"No difference of the multipliers of {second} and {first} is shown: {change}"
+    differs = f"Multiplier: {second} minus {first} is {change}{'' if one.significant else ', no difference shown'}"
     if cost.p95_m is None:
         return f"{differs}."
     low, high = cost.p95_low_m, cost.p95_high_m
-    size = f"{with_interval(cost.p95_m, low, high)} at 95 % after {CHOICE_HORIZON_M:g} m"
-    if low is not None and high is not None and low <= 0.0 <= high:
-        return f"{differs}; no cost of a calibration of {first} on {second} is shown: {size}."
-    return f"{differs}; a calibration of {first} costs {size} on {second}."
+    size = f"{with_interval(cost.p95_m, low, high)} after {CHOICE_HORIZON_M:g} m (95 %)"
+    hidden = low is not None and high is not None and low <= 0.0 <= high
+    used = f"The calibration of {first}, used on {second}, adds {size} to the error"
+    return f"{differs}. {used}{', no loss shown' if hidden else ''}."
 
 
 class _Tested(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import textwrap
 import time
@@ -225,12 +224,12 @@ def line_of(row: FleetLog) -> str:
         parts.append(f"{row.distance_m:.0f} m")
     if not row.usable:
         # the first cause, without its numbers; all of it stands in fleet.csv
-        cause = re.split("[:;] ", next((one.text for one in row.notes if notes.is_grave(one)), ""))[0]
+        cause = next((one.finding for one in row.notes if notes.is_grave(one)), "")
         return "  ".join([*parts, f"do not use: {escaped(cause)}"])
     if row.multiplier is not None:
         parts.append(f"multiplier {row.multiplier:.3f} ± {row.multiplier_std or 0.0:.3f}")
     if (p95 := row.shown_error()) is not None:
-        parts.append(f"95 %: {p95:.3g} m after 10 m")
+        parts.append(f"{p95:.3g} m after 10 m (95 %, {row.shown_row})")
     return "  ".join(parts)
 
 

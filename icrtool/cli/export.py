@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, cast, get_args
 
@@ -33,16 +34,26 @@ EXPORT_TARGETS = (*CONTROLLERS, LOCALIZATION, *TRAJECTORIES, "google-earth", "qg
 TEXT_SUFFIXES = (".txt", ".csv")
 """Suffixes of a file for one trajectory, in addition to the formats. Other text after a dot belongs to the name."""
 
+_KINDS = (
+    ("a controller", "diff_drive_controller", "clearpath, nav2, husarion", False),
+    ("a filter", LOCALIZATION, "", False),
+    ("your own node", "icr", "json", False),
+    ("evaluation", "evo -o paths", "kitti", True),
+    ("a map", "qgis -o map.geojson", "google-earth", True),
+    ("a viewer", "foxglove -o view.mcap", "", True),
+)
+"""Who needs an export: name, target with options, further targets, and whether paths of a run are needed."""
+
 ALL_THE_SAME = "--force exports it all the same"
 
 
 @click.command("export")
 @click.argument("source", metavar="[RUN|CAL.json]", required=False, type=PLACE)
-@choice("--for target", EXPORT_TARGETS, "What the result is for.", required=True)
+@choice("--for target", EXPORT_TARGETS, "What the result is for; without it, the commands are listed.")
 @option("-o --output", "FILE", FILE, "File to write; for evo and kitti a directory with a file for each path of the "
         "run, or a file with the suffix .tum, .kitti, .txt or .csv.")  # fmt: skip
 @flag("--force", "Also export what is not fit for use.")
-def export_command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
+def export_command(source: Path | None, target: str | None, output: Path | None, force: bool) -> None:
     """Print a calibration for a robot's controller, or a run for other programs.
 
     CAL.json is a file that `icrtool calibrate -o` wrote. A RUN, a directory that `icrtool fit` wrote, is calibrated
@@ -67,8 +78,7 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
       icrtool export --for evo icrtool-runs/field -o trajectories
       icrtool export --for foxglove icrtool-runs/field -o field.mcap
     """  # noqa: D301 - click reads the escape
-    if target == "foxglove" and output is None:
-        raise click.UsageError("an MCAP file is not text: name it with -o FILE.mcap")
+    target = _checked(target, source, output)
     if target in TRAJECTORIES and output is not None:
         # A file by what is there, else by a suffix that such files have.
         suffixes = (*paths.SUFFIXES.values(), *TEXT_SUFFIXES)
@@ -96,6 +106,27 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
         else:
             text = paths.format_geojson(run) if target == "qgis" else paths.format_kml(run)
     write_or_print(text if target in TRAJECTORIES else f"{text}\n", output)
+
+
+def _checked(target: str | None, source: Path | None, output: Path | None) -> str:
+    """Return the target; refuse a command without one, and a target that is not text without a file."""
+    if target is None:
+        raise click.UsageError(_what_to_type(source))
+    if target == "foxglove" and output is None:
+        raise click.UsageError("an MCAP file is not text: name it with -o FILE.mcap")
+    return target
+
+
+def _what_to_type(source: Path | None) -> str:
+    """Return a command for each kind of program that an export can be for; a calibration has no paths."""
+    name = "RUN" if source is None else shlex.quote(escaped(str(source)))
+    of_run = source is None or source.is_dir()
+    lines = [
+        f"  {user:15} icrtool export --for {first} {name}{f'   # also {others}' if others else ''}"
+        for user, first, others, paths_only in _KINDS
+        if of_run or not paths_only
+    ]
+    return "\n".join(["--for is missing: what is the export for?", *lines])
 
 
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:

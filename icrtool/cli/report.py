@@ -33,10 +33,12 @@ with when_used():
     from icrtool.output.files import atomic, formats
     from icrtool.output.page import pages, render
     from icrtool.output.tables import calibration as tables
+    from icrtool.output.tables import dropout
     from icrtool.records import calibration_document, fleet_document, requests
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
+    from icrtool.output.text_blocks import Block
     from icrtool.records.run import Run
 
 
@@ -93,7 +95,8 @@ def report_command(
                 if files.page:
                     continue
                 result = path_of(places[source])
-            _write_page(result, output, coordinates=not no_coordinates, printer=printer)
+            shown = source not in places
+            _write_page(result, output, coordinates=not no_coordinates, answers=shown, printer=printer)
     inputs.leave("sources")
 
 
@@ -110,8 +113,8 @@ def _report_on_log(
         dropout_report.report_one(source, place, config, request, files, other_results, printer)
 
 
-def _write_page(source: Path, output: Path | None, *, coordinates: bool, printer: Printer) -> None:
-    """Write the page of a result, into its folder or as `output`."""
+def _write_page(source: Path, output: Path | None, *, coordinates: bool, answers: bool, printer: Printer) -> None:
+    """Write the page of a result, into its folder or as `output`; with `answers`, print the answers of a run, too."""
     if isinstance(source, UrlPath):
         advice = "copy it to a place on disk, or write its page there: icrtool dropout-report ADDRESS"
         raise errors.RunError(source, "is a run at an address", advice)
@@ -119,16 +122,18 @@ def _write_page(source: Path, output: Path | None, *, coordinates: bool, printer
     # The usual folder of a page may hold files of a stranger.
     file, ours = (Below(place.parent, place.name), run_directory.is_page) if output is None else (place, None)
     atomic.check_place(file, ours)
-    page = _page_of(source, coordinates=coordinates)
-    atomic.write_file(file, page, ours)
-    printer.text(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
-
-
-def _page_of(source: Path, *, coordinates: bool) -> str:
-    """Return the page of a run, a fleet, a comparison or a calibration."""
     if run_directory.is_run_directory(source):
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
-            return _page_of_run(source, coordinates=coordinates)
+            page, blocks = _page_of_run(source, coordinates=coordinates)
+            printer.show(blocks if answers else ())
+    else:
+        page = _page_of(source)
+    atomic.write_file(file, page, ours)
+    printer.text(f"page        {place}")
+
+
+def _page_of(source: Path) -> str:
+    """Return the page of a fleet, a comparison or a calibration."""
     fleet = source / fleet_document.FLEET_FILE
     if formats.schema_of(Below(source, fleet_document.FLEET_FILE)).startswith(fleet_document.FLEET_FAMILY):
         with _as_written(fleet, "run icrtool batch again"):
@@ -142,21 +147,23 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
             return pages.calibration_page(formats.open_calibration(source))
     if is_special(source):
         raise errors.RunError(source, NOT_REGULAR, SAVE_IT)
-    what = "no run, fleet, comparison or calibration in it" if source.exists() else "no such file or directory"
+    if not source.exists():
+        advice = "name a log, or what icrtool fit, batch, compare -o or calibrate -o wrote"
+        raise errors.RunError(source, "no such file or directory", advice)
+    what = "no run, fleet, comparison or calibration in it"
     raise errors.RunError(source, what, "icrtool fit, batch, compare and calibrate -o make one")
 
 
-def _page_of_run(directory: Path, *, coordinates: bool) -> str:
-    """Return the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
+def _page_of_run(directory: Path, *, coordinates: bool) -> tuple[str, list[Block]]:
+    """Return the page of a run, and its answers; a report and pictures that are not there are made for the page."""
     run, report = run_directory.open_run(directory), pages.read_report(directory)
     pictures = pages.pictures_of_run(directory)
     if "trajectory" not in pictures:
         pictures = pages.draw_pictures(run) | pictures
-    if report is None:
-        document = analysis.dropout_report(run).document
-        return pages.run_page(run, document, pictures, coordinates=coordinates)
+    document = analysis.dropout_report(run).document if report is None else report
     with _as_written(directory / "dropout", "make it again with icrtool dropout-report"):
-        return pages.run_page(run, report, pictures, coordinates=coordinates)
+        page = pages.run_page(run, document, pictures, coordinates=coordinates)
+        return page, dropout.report_blocks(run.document, document)
 
 
 @contextmanager

@@ -385,8 +385,9 @@ def best_row(
     Notes
     -----
     The best row has the smallest expected error near 10 m; a mean has less random variation than a percentile. A row
-    for comparison is equally good if its expected error is smaller, or larger by less than the interval of the
-    difference.
+    for comparison is equally good if its expected error is smaller; or if it is larger by less than the interval of the
+    difference, and the intervals of both expected errors overlap. The difference alone is not enough: where all turns
+    of a drive lie in one block, its interval is wider than any error.
     """
     own = {one.name for one in calibrations if one.fitted_to_this}
     # A localisation in the log uses further sensors.
@@ -406,7 +407,8 @@ def best_row(
     for name in (name for name in means if rows[name].compared and math.isfinite(means[name][h])):
         sums = results[best].block_sums[h], results[name].block_sums[h]
         half = difference_half_width(*sums, "expected", 1.0, paired=True)
-        if (worse := float(means[name][h]) - least) <= 0.0 or worse <= half:
+        apart = results[name].column("expected_low_m")[h] > results[best].column("expected_high_m")[h]
+        if (worse := float(means[name][h]) - least) <= 0.0 or (worse <= half and not apart):
             as_good.append(name)
     heading = start_heading(results[best], h, errors.run_document.heading.source)
     return documents.BestRow(best, float(errors.horizons_m[h]), least, tuple(as_good), heading)

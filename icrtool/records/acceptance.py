@@ -178,10 +178,10 @@ class Verdict(Gate, frozen=True, kw_only=True):
             return f"{word}  {self.text}: no trial{length} in this log{log}"
         numbers = (self.margin_m, self.value_bound_m, self.baseline_m)
         margin_m, bound_m, baseline_m = (math.nan if one is None else one for one in numbers)
-        bound = f"margin {margin_m:+.4g} m"
+        bound = f"margin {margin_m:+.3g} m"
         if self.relative:
             interval = ", no interval"
             if self.margin_low_m is not None:
-                interval = f" (95 %: {self.margin_low_m:+.4g} to {self.margin_high_m:+.4g} m)"
-            bound = f"bound {bound_m:.4g} m (baseline {baseline_m:.4g} m), {bound}{interval}"
-        return f"{word}  {self.text}: {self.value_m:.4g} m, {bound}{log}"
+                interval = f" (95 %: {self.margin_low_m:+.3g} to {self.margin_high_m:+.3g} m)"
+            bound = f"bound {bound_m:.3g} m (baseline {baseline_m:.3g} m), {bound}{interval}"
+        return f"{word}  {self.text}: {self.value_m:.3g} m, {bound}{log}"

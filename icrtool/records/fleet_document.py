@@ -153,6 +153,11 @@ class FleetLog(Record, frozen=True):
         return errors.get(SHOWN_ERROR if SHOWN_ERROR in self.errors else SHOWN_FALLBACK)
 
     @property
+    def shown_row(self) -> str:
+        """Name of the row of `shown_error`."""
+        return MAIN_ROW if SHOWN_ERROR in self.errors else FALLBACK_ROW
+
+    @property
     def gates_failed(self) -> int:
         """How many acceptance limits were missed."""
         return sum(not verdict.passed for verdict in self.verdicts)
@@ -200,8 +205,10 @@ class FleetCalibration(Record, frozen=True):
 
     @property
     def within_text(self) -> str:
-        """How far, as ``, within 0.5 m (95 %) for about 15 m``; empty where that is not known."""
-        return "" if self.within is None else f", within {BUDGET_M:g} m (95 %) for {self.within.short_text}"
+        """How far, as ``, within 0.5 m (95 %) for about 15 m with recommended``; empty where that is not known."""
+        if self.within is None:
+            return ""
+        return f", within {BUDGET_M:g} m (95 %) for {self.within.short_text} with {MAIN_ROW}"
 
 
 class FleetCounts(Record, frozen=True):

@@ -6,6 +6,7 @@ cause, consequence and what to do, are in `icrtool.records.note_catalogue` and i
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 import msgspec
@@ -16,6 +17,10 @@ from icrtool.records.plain_data import Record
 
 GRAVE: Grade = "grave"
 """Grade of a finding after which the numbers must not be used."""
+
+
+_PARTS = re.compile("[:;] ")
+"""What stands between the parts of a finding's text."""
 
 
 class Note(Record, frozen=True):
@@ -38,6 +43,11 @@ class Note(Record, frozen=True):
     def sentence(self) -> str:
         """The text, after the name of its subject."""
         return f"{self.subject}: {self.text}" if self.subject else self.text
+
+    @property
+    def finding(self) -> str:
+        """What was found, without what was done about it: the text up to its first colon or semicolon."""
+        return _PARTS.split(self.text, maxsplit=1)[0]
 
 
 def note(code: str, text: str, subject: str = "") -> Note:

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from ruamel.yaml import YAML
 
-from icrtool.cli.export import CONTROLLERS
+from icrtool.cli.export import CONTROLLERS, EXPORT_TARGETS
 from support.documents import with_summary
 
 
@@ -50,6 +50,21 @@ def test_an_unknown_target_is_wrong_usage(icrtool) -> None:
     status, _, err = icrtool("export", "--for", "moveit", "icrtool-runs/mower")
     assert status == 2
     assert "diff_drive_controller" in err
+
+
+def test_without_a_target_there_is_a_command_for_each_kind_of_program(icrtool, runs: Path) -> None:
+    status, out, err = icrtool("export", "icrtool-runs/mower")
+    assert (status, out) == (2, "")
+    commands = [line.partition("icrtool ")[2].split() for line in err.splitlines() if " icrtool export --for " in line]
+    assert len(commands) == 6
+    assert {words[2] for words in commands} < set(EXPORT_TARGETS)
+    assert all("icrtool-runs/mower" in words for words in commands)
+    # what is not typed is named behind the command, so that no target is missing
+    assert all(target in err for target in EXPORT_TARGETS)
+    (runs / "season.json").write_text("{}", encoding="utf-8")
+    _, _, err = icrtool("export", "season.json")
+    assert err.count(" icrtool export --for ") == 3
+    assert "evo" not in err
 
 
 def test_a_run_that_is_not_usable_is_exported_by_force_only(icrtool, runs: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -51,12 +52,17 @@ def test_a_wrong_robot_is_asked_for_with_the_radius_that_the_log_shows(
     (named,) = (one for one in printed[2] if "is --robot right?" in one)
     assert "the log shows a wheel radius of 0.27" in named
     assert "husky-a200 has 0.165" in named
+    # the radius is the first reason and the next step: further turns would not help
+    assert re.match("Do not use: the robot goes [0-9]+ % of the distance that the wheels report; ", printed[0][0])
+    following = " ".join(line.strip() for line in printed[0] if line.startswith(("next  ", "     ")))
+    assert "is --robot right? check wheel radius" in following
+    assert not any("two full turns" in line for line in printed[0])
 
 
 def test_a_usable_run_names_the_command_that_tests_the_distance(icrtool, tmp_path: Path) -> None:
     status, out, _ = icrtool("fit", LOG, "--robot", "segway-rmp400", "--plots", "none", "-o", tmp_path / "run")
     assert status == 0
-    assert "distance    without GNSS: not known yet, icrtool dropout-report tests it" in out
+    assert out.splitlines()[-1] == f"next        icrtool dropout-report {tmp_path / 'run'}   # how far without GNSS?"
     for further in ((), ("-v",)):
         status, out, _ = icrtool("dropout-report", tmp_path / "run", "--plots", "none", *further)
         assert status == 0

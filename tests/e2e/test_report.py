@@ -125,9 +125,12 @@ def test_report_of_a_log_answers_the_whole_question_and_fits_it_once(
     assert icrtool("report", field, *ROBOT) == (0, first, "")
     assert (run / "run.json").stat().st_mtime_ns == fitted.st_mtime_ns
     assert (run / "report.html").stat().st_mtime_ns > made.st_mtime_ns
+    # Of the run, named itself, the same answer and the same page.
+    assert icrtool("report", run.relative_to(run_place)) == (0, first, "")
     status, second, _ = icrtool("report", field, *ROBOT, "-o", "mine.html", "--no-coordinates")
     assert status == 0
-    assert "written to mine.html" in second
+    assert "page        mine.html" in second
+    assert second.count("How far without GNSS?") == 1
     assert "left out" in Path("mine.html").read_text(encoding="utf-8")
 
 

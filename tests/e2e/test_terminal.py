@@ -147,7 +147,7 @@ def test_the_stretches_of_a_drive_on_several_grounds_are_whole(screen: Screen, t
     assert not any(line.endswith("…") for line in lines[: first + 3])
 
 
-def test_a_drive_that_shows_too_little_says_what_to_drive(screen: Screen) -> None:
+def test_a_drive_that_shows_too_little_says_next_step(screen: Screen) -> None:
     straight = ("--path", "straight", "--duration", "60", "-q")
     assert screen("simulate", "-o", "straight.mcap", *straight)[0] == 0
     status, lines = screen("fit", "straight.mcap", *ROBOT, "--plots", "none")
@@ -212,7 +212,7 @@ def test_a_log_is_described_on_one_screen(screen: Screen, tmp_path: Path) -> Non
     text = "\n".join(lines)
     for topic in ("/joint_states", "/gps/fix", "/imu/data"):
         assert text.count(topic) == 1
-    assert text.endswith("icrtool dropout-report drive.mcap --robot segway-rmp400")
+    assert text.endswith("icrtool report drive.mcap --robot segway-rmp400")
     assert len(screen("info", log, *ROBOT, "-v")[1]) > MOST_LINES
 
 
@@ -247,7 +247,8 @@ def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Scree
     text = " ".join("\n".join(brief).split())
     assert status == 0
     assert text.startswith("b against a: no difference of the error found; with these 2 drives a change below")
-    assert "The multiplier of b differs from the multiplier of a by" in text
+    assert "Multiplier: b minus a is +" in text
+    assert "The calibration of a, used on b, adds " in text
     assert "error [m] after 10 m, calibrated on row, tested on column" in text
     full = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *ROBOT, "-v")[1]
     assert len(full) > len(brief) + 8

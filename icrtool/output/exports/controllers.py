@@ -15,7 +15,7 @@ from icrtool.calibration.held_out import TWIST_OVER_M
 from icrtool.calibration.record import POSE_AFTER_M, Calibration, export_notes, factor_to_old
 from icrtool.errors import DataError
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
-from icrtool.motion.models import TERMS, Term, wheel_motion
+from icrtool.motion.models import FIVE, TERMS, Term, wheel_motion
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import controller_error_text
@@ -187,7 +187,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
         f"y_icr_right {right:+z.3f} ± {std_right:.3f} m, y_icr_left {left:+z.3f} ± {std_left:.3f} m, "
         f"x_icr {x:+z.3f} ± {std_x:.3f} m (body: x forward, y right)"
     )
-    held_out = f"{controller_error_text(errors)} ({calibration.recommended}; icrtool export --for icr)"
+    held_out = f"{controller_error_text(errors)}, which icrtool export --for icr writes"
     lost = (
         f"not expressible here: x_icr {x:+z.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
         f"and the ICRs' middle {(right + left) / 2:+z.3f} m right of the body's"
@@ -199,7 +199,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
             f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
             f"{factor:.4f} times the old"
         )
-    sentences += [f"WARNING: {one_line(one.sentence)}" for one in export_notes(calibration)]
+    sentences += [f"WARNING: {one_line(one.sentence)}" for one in export_notes(calibration, FIVE)]
     return [
         line for sentence in sentences for line in textwrap.wrap(f"# {sentence}", TEXT_WIDTH, subsequent_indent="# ")
     ]

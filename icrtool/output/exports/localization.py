@@ -7,6 +7,7 @@ import textwrap
 
 from icrtool.calibration.localization import Estimate, Localization
 from icrtool.calibration.record import Calibration, export_notes
+from icrtool.motion.models import FIVE
 from icrtool.output.exports.controllers import NOT_PLANAR, export_origin, one_line, yaml_number
 from icrtool.output.text_blocks import TEXT_WIDTH
 
@@ -40,7 +41,7 @@ def _header(calibration: Calibration, numbers: Localization) -> list[str]:
     row = ", ".join([*map(yaml_number, (v_x.value, v_y.value)), *[rest] * 3, yaml_number(yaw_rate.value)])
     lines = [
         *_comment(export_origin(calibration)),
-        *(line for one in export_notes(calibration) for line in _comment(f"WARNING: {one_line(one.sentence)}")),
+        *(line for one in export_notes(calibration, FIVE) for line in _comment(f"WARNING: {one_line(one.sentence)}")),
         "#",
         *_comment(
             "robot_localization takes the covariances of its inputs from their messages: it has no parameters for them."

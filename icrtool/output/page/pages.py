@@ -41,7 +41,7 @@ from icrtool.output.tables.dropout import (
     worst_section,
 )
 from icrtool.output.tables.errors import errors_section
-from icrtool.output.tables.run import streams_section, unusable_line, what_to_drive
+from icrtool.output.tables.run import streams_section, unusable_line, next_step
 from icrtool.output.text_blocks import PAGE, Block, Cell, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import (
     GLOSSARY,
@@ -164,7 +164,7 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     ]  # fmt: skip
     warnings = [one.text for one in summary.notes if not is_grave(one)]
     return [
-        unusable_line(summary), *(f"What to do: {one}" for one in (what_to_drive(summary),) if one),
+        unusable_line(summary), *(f"What to do: {one}" for one in (next_step(summary),) if one),
         Section("Answer", _cards(summary, report), name="answer"),
         controller_section(report),
         Section("The drive", drive, name="drive"),

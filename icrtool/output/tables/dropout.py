@@ -16,7 +16,7 @@ from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.errors import baseline_sections, errors_section, model_of, trials_of_first
-from icrtool.output.tables.run import number_blocks, run_checks, unusable_line, what_to_drive
+from icrtool.output.tables.run import number_blocks, run_checks, unusable_line, next_step
 from icrtool.output.text_blocks import (
     PAGE,
     VERBOSE,
@@ -91,7 +91,7 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     return [
         unusable_line(summary),
         Title(run_title(summary), trials),
-        Facts([("next", what_to_drive(summary))]),
+        Facts([("next", next_step(summary))]),
         *answer_sections(summary, report),
         *outage_blocks(report),
         errors_section(report, summary),

@@ -183,5 +183,5 @@ def next_command(log: str, options: Sequence[str], run: Run | None) -> str | Non
         return None
     options = [*options, *(() if run.document.config.robot.track_width_m is not None else ("--robot", "NAME"))]
     cut = "--from" in options or "--to" in options
-    command = "fit" if cut else "dropout-report"
+    command = "fit" if cut else "report"
     return shlex.join(["icrtool", command, log, *options])

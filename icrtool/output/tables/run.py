@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
@@ -15,6 +16,7 @@ from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.observability import lacking_turns
 from icrtool.output.text_blocks import (
     BRIEF_WIDTH,
+    LABEL,
     VERBOSE,
     Block,
     Check,
@@ -89,8 +91,10 @@ def run_blocks(summary: RunDocument) -> list[Block]:
     verdict = "" if not summary.usable else "PARTLY" if summary.partly_because else "USABLE"
     grounds = unstated_grounds(summary) if summary.usable else ()
     why = "the ground changes: no single multiplier fits the whole drive" if grounds else summary.partly_because
-    line = f"{verdict:12}{why or warnings_line(summary.notes)}".rstrip()
-    shown = line if len(line) <= BRIEF_WIDTH else f"{line[: BRIEF_WIDTH - 1].rstrip()}…"
+    label, blanks = f"{verdict:{LABEL + 2}}", " " * (LABEL + 2)
+    lines = textwrap.wrap(
+        why or warnings_line(summary.notes), BRIEF_WIDTH, initial_indent=label, subsequent_indent=blanks
+    )
     roles: dict[str, list[str]] = {}
     for stream in summary.streams:
         topics = shortened(topics_text(stream.topic), LONGEST_TOPIC)
@@ -99,7 +103,7 @@ def run_blocks(summary: RunDocument) -> list[Block]:
     return [
         unusable_line(summary),
         Title(run_title(summary), f"{driven}, turned {turned}"),
-        Line(shown, "good" if summary.usable else "as is"),
+        Line("\n".join(lines) or verdict, "good" if summary.usable else "as is"),
         Facts(_stretch_rows(grounds)),
         *(number_blocks(summary) if summary.usable else ()),
         Checks(run_checks(summary)),
@@ -114,10 +118,10 @@ def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
     if (stretches := unstated_grounds(summary)) and summary.inputs:
         times = [word for one in stretches[1:] for word in ("--terrain-change", f"{one.begin_s:.0f}")]
         command = shlex.join(["icrtool", "fit", summary.inputs[0].path, *times])
-    drive = what_to_drive(summary)
-    distance = "without GNSS: not known yet, icrtool dropout-report tests it" if summary.usable else ""
-    facts = Facts([("distance", distance), ("written to", place), ("next", drive)])
-    return [Section("", [facts, next_line("" if drive else command)])]
+    drive = next_step(summary)
+    asks = "# how far without GNSS?" if summary.usable and not stretches else ""
+    facts = Facts([("written to", place), ("next", drive)])
+    return [Section("", [facts, next_line("" if drive else f"{command}   {asks}".rstrip())])]
 
 
 def unstated_grounds(summary: RunDocument) -> tuple[GroundStretch, ...]:
@@ -139,9 +143,17 @@ def next_line(command: str) -> Line:
     return Line(f"{'next':12}{command}" if command else "", "as is")
 
 
-def what_to_drive(summary: RunDocument) -> str:
-    """Return what to drive next, of a run that is not usable for lack of turns; else empty."""
-    return "" if summary.usable else to_drive(summary)
+def next_step(summary: RunDocument) -> str:
+    """Return what to check or to drive next, of a run that is not usable; empty where nothing is known to help."""
+    if summary.usable:
+        return ""
+    wrong = next((one.text for one in summary.notes if one.code == "wheel_scale_differs"), "")
+    return wrong.partition(": ")[2] if scale_is_wrong(summary) else to_drive(summary)
+
+
+def scale_is_wrong(summary: RunDocument) -> bool:
+    """Return whether a run must not be used because the wheel radius, or the unit of the wheels, is wrong."""
+    return any(one.code == "wheel_scale_wrong" for one in summary.notes)
 
 
 def unusable_line(summary: RunDocument) -> Line:
@@ -150,10 +162,9 @@ def unusable_line(summary: RunDocument) -> Line:
 
 
 def warnings_line(notes: Sequence[Note]) -> str:
-    """Return how many warnings there are, and the first of the highest grade; none: empty."""
+    """Return how many warnings there are, and what the first of the highest grade found; none: empty."""
     count, first = sum(not is_grave(one) for one in notes), first_to_read(notes)
-    text = "" if first is None else first.text
-    return f"{counted(count, 'warning')} (-v), first: {text}" if count > 1 else text
+    return f"{counted(count, 'warning')} (-v): {first.finding}" if first is not None else ""
 
 
 def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None) -> list[Block]:
@@ -330,8 +341,13 @@ def corrections(summary: RunDocument) -> list[str]:
 
 
 def to_drive(summary: RunDocument) -> str:
-    """Return what to drive to find the ICRs that a run does not show; empty where turns would not help."""
+    """Return what to drive to find the ICRs that a run does not show; empty where turns would not help.
+
+    With a wrong wheel radius they do not: the filter then rejects what the drive shows.
+    """
     excitation = summary.excitation
+    if scale_is_wrong(summary):
+        return ""
     if excitation.verdict.all_shown:
         return lacking_turns(*np.radians([excitation.turned_right_deg, excitation.turned_left_deg]).tolist())
     return next((one.text for one in excitation.notes if one.code == "turns_lacking"), "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -35,6 +36,22 @@ def test_no_slip_is_not_as_good_for_a_robot_that_slips(run: Run) -> None:
     best = best_row(dropout_report(run, horizons_m=[5.0, 10.0]))
     assert best is not None
     assert best.as_good == ()
+
+
+def test_a_row_whose_interval_lies_apart_is_worse_however_wide_the_difference_is(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = dropout_report(run, horizons_m=[5.0, 10.0])
+    no_slip, first = report.result("no_slip"), best_row(report)
+    assert no_slip is not None
+    assert first is not None
+    best = report.result(first.model)
+    assert best is not None
+    assert no_slip.column("expected_low_m")[1] > best.column("expected_high_m")[1]
+    monkeypatch.setattr("icrtool.dropout_analysis.report.difference_half_width", lambda *_, **__: math.inf)
+    found = best_row(report)
+    assert found is not None
+    assert found.as_good == ()
 
 
 def test_without_rows_that_a_robot_can_drive_with_there_is_none(run: Run) -> None:

@@ -78,7 +78,7 @@ def test_a_straight_drive_is_not_taken_for_a_car() -> None:
 def test_a_log_that_is_not_usable_has_no_next_command() -> None:
     log = make_log(1, 120.0)
     run = fit(log, CONFIG)
-    assert next_command("log", [], run) == "icrtool dropout-report log"
+    assert next_command("log", [], run) == "icrtool report log"
     unusable = with_summary(run, usable=False, unusable_because="why")
     assert next_command("log", [], unusable) is None
     assert verdict(unusable, None, ["log"]) == "not usable: why"

@@ -77,7 +77,9 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
     lines = calibrations_text(found).splitlines()
     assert sum(not line.startswith("  ") for line in lines) == len(found)
     assert max(map(len, lines)) <= 80
-    numbers = f"multiplier {grass.multiplier:.4f} ± {grass.multiplier_std:.4f}, within 0.5 m (95 %) for"
+    assert grass.within is not None
+    far = f"within 0.5 m (95 %) for {grass.within.short_text} with recommended, in"
+    numbers = f"multiplier {grass.multiplier:.4f} ± {grass.multiplier_std:.4f}, {far}"
     assert numbers in " ".join(calibrations_text(found).split())
     write_fleet(logs, place, found)
     monkeypatch.setattr("icrtool.fleet.fleet_files.open_run", None)

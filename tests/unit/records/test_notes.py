@@ -62,8 +62,9 @@ def test_the_finding_to_read_first_is_the_gravest_that_is_no_reason() -> None:
     assert first_to_read((MOVED, *REASONS, CUT)) is CUT
     assert first_to_read((MOVED, *REASONS)) is MOVED
     assert first_to_read(REASONS) is None
-    assert warnings_line((MOVED, CUT)) == "2 warnings (-v), first: a text that says nothing"
-    assert warnings_line((MOVED,)) == MOVED.text
+    assert warnings_line((MOVED, CUT)) == "2 warnings (-v): a text that says nothing"
+    assert warnings_line((MOVED,)) == "1 warning (-v): the position lags the wheels by 0.20 s"
+    assert warnings_line(REASONS) == ""
 
 
 def test_a_run_has_its_findings_in_python_and_in_its_file(run: Run, tmp_path: Path) -> None:
