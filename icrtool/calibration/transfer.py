@@ -131,7 +131,7 @@ def _verdict(
     low, high = cost.p95_low_m, cost.p95_high_m
     size = f"{with_interval(cost.p95_m, low, high)} after {CHOICE_HORIZON_M:g} m (95 %)"
     hidden = low is not None and high is not None and low <= 0.0 <= high
-    used = f"The calibration of {first}, used on {second}, adds {size} to the error"
+    used = f"The calibration of {first}, used on {second}, changes the error by {size}"
     return f"{differs}. {used}{', no loss shown' if hidden else ''}."
 
 

@@ -282,8 +282,9 @@ class Run:
         write_run(self, Path(path), states=states, plots=plots, figures=figures)
 
     def __repr__(self) -> str:
-        drive, icr = self.document.drive, self.document.icr
-        icrs = ", ".join(f"{column} {icr_text(icr.final[column], icr.final_std[column])}" for column in ICR_COLUMNS)
+        drive = self.document.drive
+        found = ((column, self.document.icr_of_drive(column)) for column in ICR_COLUMNS)
+        icrs = ", ".join(f"{column} {icr_text(*(icr or (None, None)))}" for column, icr in found)
         return (
             f"<Run {self.name!r}: {drive.distance_m:.1f} m in {drive.duration_s:.1f} s, "
             f"{len(self.table):,} states, {icrs}, {len(self.warnings)} warnings>"

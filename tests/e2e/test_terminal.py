@@ -248,7 +248,7 @@ def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Scree
     assert status == 0
     assert text.startswith("b against a: no difference of the error found; with these 2 drives a change below")
     assert "Multiplier: b minus a is +" in text
-    assert "The calibration of a, used on b, adds " in text
+    assert "The calibration of a, used on b, changes the error by " in text
     assert "error [m] after 10 m, calibrated on row, tested on column" in text
     full = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *ROBOT, "-v")[1]
     assert len(full) > len(brief) + 8

@@ -14,6 +14,7 @@ from icrtool.calibration.record import Calibration, fitted_model, stored_calibra
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
+from icrtool.motion.robot_prior import OTHER_ROBOTS
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.errors import baseline_sections, errors_section, model_of, trials_of_first
 from icrtool.output.tables.run import number_blocks, run_checks, unusable_line, next_step
@@ -137,6 +138,9 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
     first = sorted(shown_rows(order), key=lambda name: name != best)
     notes = {one.name: one.fitted for one in report.calibrations}
     notes |= {one.name: one.knows for one in report.models if kind_of(one.name) == TOPIC_ROW}
+    # with a calibration this row has other numbers than without one
+    learned = (one for one in report.models if kind_of(one.name) == "adaptive")
+    notes |= {one.name: "from the calibration" for one in learned if not one.knows.startswith(OTHER_ROBOTS)}
     if report.best is not None:
         notes[best] = "best by wheels"
         notes |= dict.fromkeys(report.best.as_good, "as good here")
