@@ -58,7 +58,7 @@ def test_the_page_of_the_newest_run_is_in_its_directory(icrtool: Command, run_di
     assert str(Path("icrtool-runs", "barn", "report.html")) in output
     page = spaced((run_directory / "report.html").read_text(encoding="utf-8"))
     # Neither a dropout report nor pictures were there: both were made for the page, and only for it.
-    assert "within 0.5 m (95 %) on this drive, by wheel speeds alone" in page
+    assert "within 0.5 m (95 %), by wheel speeds alone" in page
     assert "data:image/png;base64," in page
     assert not (run_directory / "dropout").exists()
 
