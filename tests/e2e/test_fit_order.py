@@ -12,8 +12,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
-WRONG = ("--robot", "husky-a200", "--plots", "none")
-"""The robot of the sample log has wheels of 0.27 m, this one of 0.165 m."""
+SCALES = ("--set", "wheels.left_scale=1", "--set", "wheels.right_scale=1")
+WRONG = ("--robot", "husky-a200", *SCALES, "--plots", "none")
+"""The robot of the sample log has wheels of 0.27 m, this one of 0.165 m; a scale that is set is not corrected."""
 
 
 @pytest.fixture(scope="module")
