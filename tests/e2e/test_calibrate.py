@@ -102,7 +102,7 @@ def test_quiet_prints_nothing(icrtool, field: Path) -> None:
     assert icrtool("calibrate", field, *HUSKY, "-q") == (0, "", "")
 
 
-def test_info_says_what_the_drive_could_show_and_next_step_next(icrtool) -> None:
+def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> None:
     status, out, err = icrtool("info", LOG, *ROBOT)
     assert (status, err) == (0, "")
     assert re.search(r"excitation all three ICRs shown.* turned 9\d\d° right, 8\d\d° left", " ".join(out.split()))

@@ -147,7 +147,7 @@ def test_the_stretches_of_a_drive_on_several_grounds_are_whole(screen: Screen, t
     assert not any(line.endswith("…") for line in lines[: first + 3])
 
 
-def test_a_drive_that_shows_too_little_says_next_step(screen: Screen) -> None:
+def test_a_drive_that_shows_too_little_says_what_to_drive(screen: Screen) -> None:
     straight = ("--path", "straight", "--duration", "60", "-q")
     assert screen("simulate", "-o", "straight.mcap", *straight)[0] == 0
     status, lines = screen("fit", "straight.mcap", *ROBOT, "--plots", "none")

@@ -119,9 +119,10 @@ def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
         times = [word for one in stretches[1:] for word in ("--terrain-change", f"{one.begin_s:.0f}")]
         command = shlex.join(["icrtool", "fit", summary.inputs[0].path, *times])
     drive = next_step(summary)
-    asks = "# how far without GNSS?" if summary.usable and not stretches else ""
-    facts = Facts([("written to", place), ("next", drive)])
-    return [Section("", [facts, next_line("" if drive else f"{command}   {asks}".rstrip())])]
+    tested = summary.usable and not stretches
+    distance = "without GNSS: not known yet; the next command tests it" if tested else ""
+    facts = Facts([("written to", place), ("distance", distance), ("next", drive)])
+    return [Section("", [facts, next_line("" if drive else command)])]
 
 
 def unstated_grounds(summary: RunDocument) -> tuple[GroundStretch, ...]:

@@ -161,7 +161,7 @@ def test_the_drawing_of_the_drive_marks_the_worst_trial(run: Run, report: Dropou
     assert sketch.bar_m in {0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0}
 
 
-def test_a_run_with_too_few_turns_states_next_step(run: Run, report: DropoutReport) -> None:
+def test_a_run_with_too_few_turns_states_what_to_drive(run: Run, report: DropoutReport) -> None:
     excitation = run.summary["excitation"] | {"turned_right_deg": 0.0, "turned_left_deg": 9.0}
     straight = with_summary(run, usable=False, unusable_because="it turns too little", excitation=excitation)
     page = run_page(straight, report.document, {})
