@@ -41,7 +41,7 @@ from icrtool.output.tables.dropout import (
     worst_section,
 )
 from icrtool.output.tables.errors import errors_section
-from icrtool.output.tables.run import streams_section, unusable_line, next_step
+from icrtool.output.tables.run import next_step, streams_section, unusable_line
 from icrtool.output.text_blocks import PAGE, Block, Cell, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import (
     GLOSSARY,

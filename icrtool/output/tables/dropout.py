@@ -17,7 +17,7 @@ from icrtool.motion.models import TERMS, FittedModel
 from icrtool.motion.robot_prior import OTHER_ROBOTS
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.errors import baseline_sections, errors_section, model_of, trials_of_first
-from icrtool.output.tables.run import number_blocks, run_checks, unusable_line, next_step
+from icrtool.output.tables.run import next_step, number_blocks, run_checks, unusable_line
 from icrtool.output.text_blocks import (
     PAGE,
     VERBOSE,
