@@ -34,7 +34,7 @@ EXPORT_TARGETS = (*CONTROLLERS, LOCALIZATION, *TRAJECTORIES, "google-earth", "qg
 TEXT_SUFFIXES = (".txt", ".csv")
 """Suffixes of a file for one trajectory, in addition to the formats. Other text after a dot belongs to the name."""
 
-_KINDS = (
+_EXAMPLE_COMMANDS = (
     ("a controller", "diff_drive_controller", "clearpath, nav2, husarion", False),
     ("a filter", LOCALIZATION, "", False),
     ("your own node", "icr", "json", False),
@@ -123,7 +123,7 @@ def _what_to_type(source: Path | None) -> str:
     of_run = source is None or source.is_dir()
     lines = [
         f"  {user:15} icrtool export --for {first} {name}{f'   # also {others}' if others else ''}"
-        for user, first, others, paths_only in _KINDS
+        for user, first, others, paths_only in _EXAMPLE_COMMANDS
         if of_run or not paths_only
     ]
     return "\n".join(["--for is missing: what is the export for?", *lines])

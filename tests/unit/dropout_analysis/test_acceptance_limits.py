@@ -103,7 +103,7 @@ def test_a_gate_without_trials_fails_and_says_so(run: Run) -> None:
 def test_the_verdict_names_number_bound_and_margin(report: DropoutReport) -> None:
     value = float(report.results[0].column("p95_m")[0])
     line = check_gate(parse_gate("icr.p95@1m <= 3"), report).verdict
-    assert line.startswith(f"pass  icr.p95@1m <= 3: {value:.4g} m, margin {3 - value:+.4g} m")
+    assert line.startswith(f"pass  icr.p95@1m <= 3: {value:.3g} m, margin {3 - value:+.3g} m")
     assert report.name in line
 
 

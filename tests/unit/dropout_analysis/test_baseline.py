@@ -153,9 +153,9 @@ def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, writt
     assert far.margin_high_m < 0
     for part in (
         "0.1 * baseline",
-        f"{far.value_m:.4g} m",
-        f"{far.value_bound_m:.4g} m",
-        f"{far.margin_m:+.4g} m",
+        f"{far.value_m:.3g} m",
+        f"{far.value_bound_m:.3g} m",
+        f"{far.margin_m:+.3g} m",
         report.name,
     ):
         assert part in far.verdict
