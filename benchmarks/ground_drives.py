@@ -145,6 +145,17 @@ def simulate(count: int, seed: int = 40) -> list[dict[str, TrueDrive]]:
     return made
 
 
+def simulate_grounds(count: int, seed: int, grounds: int) -> list[dict[str, TrueDrive]]:
+    """Return a drive of each of some robots on each of some grounds of different kinds, by name."""
+    made = []
+    for number in range(count):
+        rng = np.random.default_rng([seed, number])
+        robot = draw_robot(rng)
+        names = [f"ground{one}" for one in range(grounds)]
+        made.append({name: _drive(f"robot{number:02d}{name}", robot, draw_ground(rng), rng) for name in names})
+    return made
+
+
 def _drive(name: str, robot: GroundRobot, ground: Ground, rng: np.random.Generator) -> TrueDrive:
     """Return one drive, with the wheel speeds of `_commands` as they are."""
     t = np.arange(round(SECONDS / STEP_S)) * STEP_S

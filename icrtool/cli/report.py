@@ -59,9 +59,10 @@ def report_command(
     """Answer the whole question of a LOG on one screen and one page; or write the page of a result.
 
     A LOG is fitted, unless its run is there, and tested: numbers for the controller, how far without GNSS, whether to
-    trust them, and the worst case. RUN is a directory that `icrtool fit` wrote, with or without its dropout report;
-    FLEET the folder of `icrtool batch`; COMPARISON what `icrtool compare -o` wrote, CAL.json what `icrtool calibrate
-    -o` wrote. Without an argument: the newest run below icrtool-runs/. A page is one HTML file that needs no network.
+    trust them, and the worst case. RUN is a directory that `icrtool fit` wrote, with or without its dropout report,
+    which --calibration makes again; FLEET the folder of `icrtool batch`; COMPARISON what `icrtool compare -o` wrote,
+    CAL.json what `icrtool calibrate -o` wrote. Without an argument: the newest run below icrtool-runs/. A page is one
+    HTML file that needs no network.
 
     \b
     Example:
@@ -78,25 +79,27 @@ def report_command(
         advice = "leave it out: each page goes to its own directory"
         raise errors.ConfigError("-o", "names one file for several pages", advice)
     logs = tuple(source for source in sources if is_log(source))
-    if calibrations and (others := [source for source in sources if source not in logs]):
-        why = f"{escaped(str(others[0]))} is not a log, and its page shows the result that is there"
-        advice = "name the log; icrtool dropout-report RUN --calibration CAL.json makes the report of a run again"
-        raise errors.ConfigError("--calibration", why, advice)
+    again = tuple(source for source in sources if calibrations and run_directory.is_run_directory(source))
+    if calibrations and (others := [source for source in sources if source not in {*logs, *again}]):
+        why = f"{escaped(str(others[0]))} is no log and no run, and its page shows the result that is there"
+        raise errors.ConfigError("--calibration", why, "name logs or runs")
     if not logs:
-        check_run_config(config)
+        check_run_config(config, free="dropout" if again else "")
     places = dict(zip(logs, run_directories(logs, ResultPlace(into=into)), strict=True))
     inputs = Inputs("source")
     for source in sources:
         with inputs.each(source):
             result = source
+            files = requests.ResultFiles(overwrite=overwrite, page=output is None and not no_coordinates)
             if source in places:
-                files = requests.ResultFiles(overwrite=overwrite, page=output is None and not no_coordinates)
                 _report_on_log(source, places[source], config, report, files, other_results, printer)
-                if files.page:
-                    continue
                 result = path_of(places[source])
-            shown = source not in places
-            _write_page(result, output, coordinates=not no_coordinates, answers=shown, printer=printer)
+            elif source in again:
+                asked = report.configured(config)
+                dropout_report.report_one(source, None, config, asked, files, other_results, printer)
+            reported = source in {*places, *again}
+            if not (reported and files.page):
+                _write_page(result, output, coordinates=not no_coordinates, answers=not reported, printer=printer)
     inputs.leave("sources")
 
 

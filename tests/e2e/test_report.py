@@ -185,6 +185,15 @@ def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_ha
     assert "calibration" in [line.split()[0] for line in shown.splitlines() if line.strip()]
     assert "not fitted to this log" in spaced((run / "report.html").read_text(encoding="utf-8"))
 
+    # the report of a finished run is made again, from the run
+    (run / "dropout" / "report.json").unlink()
+    status, shown, errors = icrtool("report", run, *asked[1 + len(ROBOT) :])
+    assert (status, errors) == (0, "")
+    assert calibration_rows(run) == expected
+    status, _, errors = icrtool("report", other.name, *asked[1 + len(ROBOT) :])
+    assert status == 1
+    assert "is no log and no run" in errors
+
     status, shown, errors = icrtool("batch", *asked, "--plots", "none", "--no-page", "-o", "results", "-j", "1")
     assert (status, errors) == (0, "")
     assert calibration_rows(run_place / "results" / "runs" / field.stem) == expected
