@@ -143,8 +143,11 @@ def with_right_size(log: RobotLog, config: Config) -> tuple[RobotLog, float]:
     A constant factor that tyres and soil do not explain is the factor of a wrong radius, resolution, gear or unit: slip
     is not the same in every span. Configured scales are left as they are.
     """
-    wheels, given = log.wheels, config.wheels
-    if given.left_scale != "auto" or given.right_scale != "auto":
+    wheels, settings = log.wheels, config.wheels
+    if settings.left_scale != "auto" or settings.right_scale != "auto":
+        return log, 1.0
+    if not all(np.isfinite(one).all() for one in (log.gnss.north_m, log.gnss.east_m, wheels.left, wheels.right)):
+        # refused later
         return log, 1.0
     scale = reference_scale(wheels.stamp_ns, wheels.v_left_mps, wheels.v_right_mps, log.gnss)
     if scale is None or abs(scale.value - 1.0) <= ROLLING_SCALE + EVIDENCE_SIGMAS * scale.std:
