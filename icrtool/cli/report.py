@@ -128,7 +128,8 @@ def _write_page(source: Path, output: Path | None, *, coordinates: bool, answers
     if run_directory.is_run_directory(source):
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
             page, blocks = _page_of_run(source, coordinates=coordinates)
-            printer.show(blocks if answers else ())
+            if answers:
+                printer.show(blocks)
     else:
         page = _page_of(source)
     atomic.write_file(file, page, ours)
