@@ -229,7 +229,7 @@ def line_of(row: FleetLog) -> str:
     if row.multiplier is not None:
         parts.append(f"multiplier {row.multiplier:.3f} ± {row.multiplier_std or 0.0:.3f}")
     if (p95 := row.shown_error()) is not None:
-        parts.append(f"{p95:.3g} m after 10 m (95 %, {row.shown_row})")
+        parts.append(f"95 %: {p95:.3g} m after 10 m")
     return "  ".join(parts)
 
 

@@ -153,11 +153,6 @@ class FleetLog(Record, frozen=True):
         return errors.get(SHOWN_ERROR if SHOWN_ERROR in self.errors else SHOWN_FALLBACK)
 
     @property
-    def shown_row(self) -> str:
-        """Name of the row of `shown_error`."""
-        return MAIN_ROW if SHOWN_ERROR in self.errors else FALLBACK_ROW
-
-    @property
     def gates_failed(self) -> int:
         """How many acceptance limits were missed."""
         return sum(not verdict.passed for verdict in self.verdicts)
