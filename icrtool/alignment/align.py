@@ -1,4 +1,4 @@
-"""Align the sensors of a log: from what was sent to what the filter can use, with the position reference that fits."""
+"""Align the sensors of a log: correct its streams for the filter, and choose its position reference."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ def align(log: RobotLog, config: Config) -> Measurements:
     """
     configured_shifts = NO_SHIFTS
     if config.filter.rules.corrects:
-        # before anything looks at the streams
+        # The delays come first: all later steps compare the streams.
         log, config, configured_shifts = with_configured_delays(log, config)
         log = without_interpolated(log)
     log = with_wheel_speeds(log, config)
     if not config.filter.rules.corrects:
-        # it takes its wheels as they are
+        # Preset ``paper`` uses the wheel speeds as sent.
         return _align_once(log, config)
     log, size = with_right_size(without_bad_start(without_frozen(log)), config)
     width = width_or_usual_m(config.robot.track_width_m)
@@ -83,7 +83,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
 
 
 def _with_size(found: Measurements, factor: float) -> Measurements:
-    """Return measurements whose scales count from the wheels as sent, which were multiplied with a factor first."""
+    """Return measurements whose scales include a factor by which the wheel speeds were multiplied before."""
     if factor == 1.0:
         return found
     facts = found.wheels
@@ -177,7 +177,7 @@ def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
 
 
 def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
-    """Return the antenna's place in the body frame, forward and right [m]: configured, else the log's own, else 0."""
+    """Return the antenna's position forward and right [m], body frame: from the configuration, else the log, else 0."""
     forward, right = log.antenna_m if log.antenna_m is not None else (0.0, 0.0)
     frames = config.frames
     return (
@@ -273,7 +273,7 @@ NONE = Agreement(math.inf, 0.0)
 
 
 def choose_reference(log: RobotLog, config: Config) -> RobotLog:
-    """Return the log with the position reference that its wheels and headings support; preset ``paper``: as it is."""
+    """Return the log with the position reference that its wheels and headings support; preset ``paper``: unchanged."""
     if not log.other_references or not config.filter.rules.corrects or not len(log.heading.stamp_ns):
         return log
     chosen = measure_agreement(log, config)

@@ -41,8 +41,8 @@ LARGEST_R2 = 0.98
 has no further meaning."""
 
 LEAST_CHANGE = 1e-3
-"""Variance of the pairs of a lag, as a share of the variance of the whole column, below which the rounding of Fourier
-transforms matters."""
+"""Smallest variance of the values that overlap at a lag, as a share of the variance of the whole column. With a smaller
+variance the rounding errors of Fourier transforms are too large, and the correlation is computed directly."""
 
 LEAP_S = 18.0
 """Time by which GPS time is ahead of UTC since 2017 [s]."""
@@ -53,7 +53,7 @@ class Shifts(NamedTuple):
 
     Attributes
     ----------
-    gnss, heading : of positions and headings; 0 where nothing was moved
+    gnss, heading : times of positions and of headings; 0 for a stream that was not moved
     notes : what was found
     """
 
@@ -89,8 +89,8 @@ def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Con
 def _moved(log: RobotLog, config: Config, gnss_s: float, heading_s: float) -> RobotLog:
     """Return a log whose fixes and headings are stamped earlier by some seconds.
 
-    Turn rates in the messages of the headings have their clock, and are moved with them. Less than `SHORTEST_SHIFT_S`
-    may be the delay of a filter, which turn rates do not have.
+    Turn rates in the messages of the headings are moved by the same time, because they have the same clock. They are
+    not moved by `SHORTEST_SHIFT_S` or less: such a shift may be the delay of a filter that only the headings pass.
     """
     moved: dict[str, Any] = {
         name: replace(stream, stamp_ns=stream.stamp_ns - round(by * 1e9))
@@ -171,7 +171,7 @@ def _sentence(word: str, shift_s: float, key: str) -> str:
 
 
 def _can_be_compared(log: RobotLog) -> bool:
-    """Return whether wheels and positions hold two finite values or more; what else is wrong is refused later."""
+    """Return whether wheels and positions hold at least two finite values each; other faults are refused later."""
     wheels, gnss = log.wheels, log.gnss
     if min(len(wheels.stamp_ns), len(gnss.stamp_ns)) < 2:
         return False
@@ -222,7 +222,7 @@ class _Rates(NamedTuple):
 
     @classmethod
     def of_gyro(cls, gyro: GyroAxes, log: RobotLog) -> _Rates:
-        """Return the turn rate about the axis of a gyro about which it turns most."""
+        """Return the turn rate about the gyro axis with the most turn."""
         if len(gyro.stamp_ns) < 2:
             return cls(None, None)
         t = (gyro.stamp_ns - gyro.stamp_ns[0]) / 1e9
@@ -233,7 +233,7 @@ class _Rates(NamedTuple):
 
 
 def _grid(log: RobotLog) -> Ints:
-    """Return the times of the grid [ns]: the time of the wheels, extended by the largest shift of a stream."""
+    """Return the times of the grid [ns]: the time span of the wheels, extended by the largest shift on both sides."""
     first, last = int(log.wheels.stamp_ns[0]), int(log.wheels.stamp_ns[-1])
     count = min(int((last - first) / (GRID_S * 1e9)) + 1, MOST_STEPS)
     around = round(LONGEST_SHIFT_S / GRID_S)
@@ -258,7 +258,7 @@ def _known(stamps: Ints, log: RobotLog) -> Bools:
 
 
 def find_shift(wheels: _Rates, stream: _Rates) -> float:
-    """Return how much later than the wheels a stream is stamped [s]; 0 where it is less than 3 s, or not shown.
+    """Return the time by which a stream is stamped later than the wheels [s]; 0 where it is below 3 s, or not shown.
 
     Notes
     -----
@@ -288,7 +288,7 @@ def find_shift(wheels: _Rates, stream: _Rates) -> float:
 
 
 def _correlations(column: Floats, later_column: Floats, lags: Ints) -> tuple[Floats, Floats]:
-    """Return squared correlations (l,) of a column with one that is `lags` steps later, and numbers of pairs.
+    """Return squared correlations (l,) of a column with another column `lags` steps later, and numbers of pairs (l,).
 
     Notes
     -----
@@ -309,7 +309,7 @@ def _correlations(column: Floats, later_column: Floats, lags: Ints) -> tuple[Flo
     found = np.zeros(len(lags))
     together = sums(1, 1) / pairs - own_mean * seen_mean
     found[clear] = together[clear] ** 2 / (own_change[clear] * seen_change[clear])
-    # few pairs at the ends would seem to fit
+    # A few pairs at the ends of the columns may correlate by chance.
     enough = counts >= 0.5 * counts.max(initial=0.0)
     for row in np.flatnonzero(enough & ~clear):
         found[row] = _correlation(column, later_column, int(lags[row]))
@@ -328,7 +328,7 @@ def _powers(column: Floats) -> Floats:
 
 
 def _correlation(column: Floats, later_column: Floats, lag: int) -> float:
-    """Return the squared correlation of a column with one that is some steps later; 0 where one is constant."""
+    """Return the squared correlation of a column with another column `lag` steps later; 0 for a constant column."""
     a, b = (column[: len(column) - lag], later_column[lag:]) if lag >= 0 else (column[-lag:], later_column[:lag])
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]

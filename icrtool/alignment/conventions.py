@@ -40,8 +40,8 @@ from icrtool.records.notes import Note, note
 from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
-"""Standard deviations of robots from Z_v = 1, Z_u = 0 (complex: two each), turn = 1 (largest coefficient), asymmetry
-0."""
+"""Standard deviations, between robots, of the six fitted values: Z_v about 1 and Z_u about 0 (two real numbers each),
+the turn about 1 (largest coefficient), the asymmetry about 0."""
 
 DECISIVE = 25.0
 """Twice the gain in log-likelihood from which on a hypothesis is preferred to the names in the log: 5 sigma."""
@@ -130,7 +130,7 @@ def decide_conventions(
 
     Parameters
     ----------
-    metric : whether positions may be mirrored (a pose in a local frame); geodetic ones are not
+    metric : whether positions may be mirrored (a pose in a local frame); geodetic positions may not
     gyro_sense : +1 where a gyro turns as the heading is named, -1 where in the opposite sense, 0 without one
     mirror_allowed : whether the heading's handedness is free
     """
@@ -164,7 +164,7 @@ def decide_conventions(
 
 
 class NamedFit(NamedTuple):
-    """How positions fit to wheels and heading as they are named.
+    """Agreement of the positions with wheels and heading, with the names in the log.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class NamedFit(NamedTuple):
     turn_sigmas: float
 
     def cost(self, scatter: float) -> float:
-        """Return twice the negative log-likelihood with some scatter; overlapping windows count once."""
+        """Return twice the negative log-likelihood for a given scatter; overlapping windows count once."""
         return soft_l1_loss(self.residuals / scatter) / STARTS_A_WINDOW
 
     @classmethod
@@ -194,7 +194,7 @@ class NamedFit(NamedTuple):
 
 
 def senses_by_distance(track: Track) -> Convention:
-    """Return whether one side counts backwards, by distances alone: for a drive without a heading.
+    """Return the convention that distances alone show, for a drive without a heading: which side counts backwards.
 
     Either side may be the reversed one; the choice is the one with which the robot drives forward.
     """
@@ -217,7 +217,7 @@ TIE = 9.0
 
 
 def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -> _Shown:
-    """Fit displacements and turns for one handedness, with hardly any prior.
+    """Return the fit of displacements and turns for one handedness, under a prior with hardly any effect.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def _cost(convention: Convention, fit: _Shown) -> tuple[float, float]:
 
 
 def convention_notes(decision: Decision, *, corrects: bool, mirrored: bool = False) -> list[Note]:
-    """Return findings on which sides or senses are not as named; the heading's own is reported with its offset.
+    """Return findings about sides and senses that differ from their names, except the sense of the heading.
 
     `mirrored`: the log has no gyro and no heading, so that swapped sides and mirrored positions look alike.
     """

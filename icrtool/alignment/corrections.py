@@ -69,7 +69,7 @@ class Delay(NamedTuple):
 
     @property
     def is_significant(self) -> bool:
-        """Whether it is known well, and is not zero."""
+        """Whether the delay is known well and differs significantly from zero."""
         return self.std_s < LARGEST_STD_S and abs(self.value_s) > CORRECTION_SIGMAS * self.std_s
 
 
@@ -97,9 +97,9 @@ class StreamDelays(NamedTuple):
     def clock_std_s(self) -> float:
         """Standard deviation of the time between position and heading after the correction [s].
 
-        Before a drive, clocks agree with probability 0.5. Where they were assumed to agree, the deviation is the
-        deviation of the other case times its probability (Bayes factor of Dickey 1971: densities at zero after and
-        before the drive).
+        Prior: the clocks agree with probability 0.5. If no delay between them was corrected, the variance is the second
+        moment of the delay of clocks that differ, times the probability that they differ (Bayes factor of Dickey 1971:
+        ratio of the densities at zero after and before the drive).
         """
         value, std = self.apart
         if self.together or not math.isfinite(std):
@@ -140,7 +140,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
     if not heading.std_s < LARGEST_STD_S:
         return 0.0, 0.0
     lag, after = heading.value_s, apart.value_s
-    # as stamped; both alike; the heading alone; the position alone; each by itself
+    # Five combinations: no delay; one delay of both; the heading alone; the position alone; a delay of each.
     free = {(0.0, 0.0): 0, (lag, lag): 1, (lag, 0.0): 1, (0.0, after): 1, (lag, lag + after): 2}
     costs = {
         (first, second): ((lag - first) / heading.std_s) ** 2
@@ -153,7 +153,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
 
 
 def _is_large(delay_s: float) -> bool:
-    """Return whether a delay is more than a robot's response to its wheels."""
+    """Return whether a delay is longer than a robot's response to its wheels."""
     return delay_s > RESPONSE_S or delay_s < -SMALLEST_LEAD_S
 
 
@@ -179,7 +179,7 @@ class AlignedStreams(NamedTuple):
 
     Attributes
     ----------
-    log : corrected, but for the heading's offset, which is in `heading` and which the filter applies
+    log : with all corrections but the heading's offset. This offset is in `heading`, and the filter applies it
     wheels, heading : facts about them
     scales : factors of the left and of the right speeds, in addition to the configured scales
     correlation_s : correlation time of the noise of a stated heading, where the noise was raised
@@ -200,7 +200,7 @@ class AlignedStreams(NamedTuple):
     notes: tuple[Note, ...]
 
     def steps(self) -> tuple[FixSteps, FixSteps]:
-        """Return steps of position and of heading [rad] between the fixes, beyond the motion of the wheels.
+        """Return steps of position and of heading [rad] between the fixes, minus the motion of the wheels.
 
         Without an estimate there are no steps of the heading.
         """
@@ -214,7 +214,7 @@ class AlignedStreams(NamedTuple):
 
 
 def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
-    """Estimate what relates wheels, heading and positions, and correct what is significant.
+    """Return the streams of a log with their significant errors corrected, and the estimates of these errors.
 
     Raises
     ------
@@ -268,7 +268,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
 def _name_streams(
     log: RobotLog, config: Config, width_m: float
 ) -> tuple[RobotLog, DerivedHeading | None, Decision, DriveWindows, list[Note], bool]:
-    """Find the heading of a log without one, then which side is which, and in which sense streams turn.
+    """Return a log with a heading, and with the names of sides and senses that fit the motion.
 
     Returns
     -------

@@ -11,8 +11,9 @@ y_r = (∂v_x/∂V_l)/(∂ω/∂V_l), y_l = (∂v_x/∂V_r)/(∂ω/∂V_r), x = 
 computed with the measured turn psi', not with the wheels' turn: the latter leads while the robot begins to turn, which
 has the same effect as a delay.
 
-A drive does not separate a sideways crab from the offset, the antenna's place from the ICRs (forward from x_icr, right
-from the middle of y), or, at constant speed, sideways slip l from tau_p. There the priors decide.
+A drive does not separate a sideways drift on straight paths from the offset. It does not separate the antenna's
+position from the ICRs: its forward part from x_icr, its right part from the middle of the y ICRs. At constant speed it
+does not separate sideways slip l from tau_p. In these cases the priors decide.
 """
 
 from __future__ import annotations
@@ -71,8 +72,8 @@ SMOOTH_S = 0.2
 """Half the time over which the heading is averaged for the sideways motion [s]. Its noise would reduce this motion."""
 
 OVERLAP = 1.0
-"""Number of residuals that count as one independent residual: each, because their windows end at different fixes.
-The spread between groups of windows shows common errors."""
+"""Number of residuals that count as one independent residual. Each residual counts, because the windows end at
+different fixes; errors that windows have in common show in the spread between groups of windows."""
 
 RESPONSE_STD_S = RESPONSE_S / math.sqrt(12.0)
 """Standard deviation of a robot's response to its wheels [s]. No drive separates it from a delay of the streams."""
@@ -85,7 +86,8 @@ On 19 rigid-body drives without any delay it is 0.1 s/m rms (0.03 s rms where b 
 m), on five recorded drives with b = 1.1 m 0.04 s rms."""
 
 SCALE_STD = 0.003
-"""Standard deviation of the scale by slip that varies with speed and turns, rms on the same drives."""
+"""Standard deviation of the wheel scale, from slip that varies with speed and turns: rms on the drives of
+`CLOCK_S_PER_M`."""
 
 SLIPPING = 0.08
 """Relative difference between the distances of wheels and positions, from window to window, above which wheels slip.
@@ -166,7 +168,7 @@ class AlignmentFit(NamedTuple):
 
     @property
     def scatter(self) -> tuple[float, float]:
-        """Robust scatter of the displacements along and across the heading beyond the fixes' noise, over the length."""
+        """Robust scatter of the displacements along and across the heading beyond the fixes' noise, as shares."""
         noise2 = 2.0 * self.windows.track.place_std_m**2
         beyond = np.maximum(self.fit.scale[[0, len(self.windows.begin)]] ** 2 - noise2, 0.0)
         along, across = (np.sqrt(beyond) / self.windows.usual_length_m).tolist()
@@ -174,7 +176,7 @@ class AlignmentFit(NamedTuple):
 
     @property
     def turn_wander_rad(self) -> float:
-        """Rms wander of the heading from the wheels' turn in a second [rad], from short windows."""
+        """Rms difference between the turns of heading and wheels in a second [rad], from short windows."""
         u = len(self.windows.turn_begin)
         length = self.windows.turn_end - self.windows.turn_begin
         return float(np.sqrt(np.mean(self.fit.residuals[-u:] ** 2 / length)))
@@ -227,14 +229,15 @@ def residuals_by_estimate(fit: AlignmentFit) -> ResidualsByEstimate:
 def _clock_std_s(track: Track, width_m: float) -> float:
     """Return the standard deviation of the time between position and heading that no drive shows [s].
 
-    A heading that the wheels carry turns at once; the body turns after its response, which is not known.
+    A heading that is carried by the wheels turns with the wheels. The body turns later, by a response time that is not
+    known.
     """
     std = RESPONSE_STD_S if track.same_clock else max(CLOCK_S_PER_M * width_m, RESPONSE_STD_S)
     return std if track.measured_t is None else math.hypot(std, RESPONSE_STD_S)
 
 
 def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | None:
-    """Estimate all parameters jointly; None with too few windows.
+    """Return the joint estimate of all parameters; None with too few windows.
 
     Parameters
     ----------
@@ -243,8 +246,8 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
 
     Notes
     -----
-    Soft-L1 weights, each residual kind (along, across, turn) with its own robust scale; covariance from groups of
-    distance (`icrtool.kernels.robust`).
+    The residuals have soft-L1 weights, and each kind of residual (along, across, turn) has its own robust scale. The
+    covariance comes from groups of distance (`icrtool.kernels.robust`).
     """
     if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return None

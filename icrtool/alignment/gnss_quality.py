@@ -1,4 +1,4 @@
-"""Classes of the fixes: fixed, float or other by what they state and how they move; noise by class.
+"""Classes of the fixes (fixed, float, other) from their messages and their motion, and the noise of each class.
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
 tens of seconds. If they were treated as independent, the filter would follow them. Some drivers still state a
@@ -69,7 +69,7 @@ class GnssQuality(NamedTuple):
 
 
 def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: float = math.nan) -> GnssQuality:
-    """Return the classes of the fixes, and the noise of each.
+    """Return the classes of the fixes, and the noise of each class.
 
     The order of evidence: the status, flags or solution type in the message; the stated variance; the motion of the
     fixes relative to the wheels. A stretch that is noisier than the rest, or lies between two jumps that cancel each
@@ -139,7 +139,7 @@ def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
 
 
 def _losses(stamps: Ints, fixed: Bools) -> Ints:
-    """Return the long enough spans without a fixed solution, from the last fixed fix before to the next one.
+    """Return the long spans without a fixed solution, from the last fixed fix before to the next fixed fix.
 
     Fixes that are not fixed at the begin or the end of the log also make a span.
     """
@@ -199,8 +199,8 @@ float if the ratio is larger."""
 
 LONGEST_EXCURSION_S = 60.0
 TAKEN_BACK = 0.25
-"""A second jump within this time cancels the first one, if the remaining part is at most this share. The fixes between
-them were wrong."""
+"""Longest time between two jumps that cancel each other [s], and largest share of the first jump that then remains. The
+fixes between two such jumps are wrong."""
 
 MOST_RTK_JUMPS = 500
 """Largest number of jumps of a receiver that sometimes loses RTK. With more, the reference has another kind of

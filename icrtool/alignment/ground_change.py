@@ -53,7 +53,7 @@ class GroundChanges(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What was found, and what to do."""
+        """The finding for the user: times and multipliers of the changes, and the options to set."""
         values = _joined([f"{one.multiplier:.3f} ± {max(one.multiplier_std, 0.001):.3f}" for one in self.stretches])
         when = _joined([f"{t:.0f} s" for t in self.times_s])
         options = " ".join(f"--terrain-change {t:.0f}" for t in self.times_s)
@@ -90,8 +90,9 @@ def find_changes(fit: AlignmentFit) -> GroundChanges | None:
     Notes
     -----
     Least squares of the heading's turn by the wheels' turn in each stretch, with the best times for each number of
-    changes (dynamic programming: Bellman and Roth 1969); a change is worth `CHANGE_GAIN`. Deviations by groups of time
-    (White 1980; Liang and Zeger 1986). Each stretch must show its ratio, and differ from the next one.
+    changes (dynamic programming: Bellman and Roth 1969); each change must gain `CHANGE_GAIN`. The standard deviations
+    come from groups of time (White 1980; Liang and Zeger 1986). Each stretch must show its ratio, and differ from the
+    next one.
     """
     turns = _turns(fit)
     if turns is None:
@@ -135,7 +136,7 @@ def _turns(fit: AlignmentFit) -> _Turns | None:
 
 
 def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list[float]]:
-    """Return for 0, 1, ... changes the rows that divide the windows, with both ends, and the sum of squares left over.
+    """Return the rows that divide the windows, both ends included, and the sum of squares, by number of changes.
 
     Parameters
     ----------
@@ -186,7 +187,7 @@ def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
 
 
 def _stretches(turns: _Turns, rows: list[int]) -> tuple[GroundStretch, ...] | None:
-    """Return the stretches between rows, None where one does not show its multiplier or equals the next one."""
+    """Return the stretches between rows, None where a multiplier is not shown, or equals the next."""
     stretches, ratios = list[GroundStretch](), list[tuple[float, float]]()
     for first, stop in pairwise(rows):
         part = turns.rows(first, stop)

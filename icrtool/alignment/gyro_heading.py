@@ -48,15 +48,19 @@ STANDING_RATE_STD = math.radians(0.05)
 GYRO_STATE_PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1])
 ABSOLUTE_PRIOR_STD = np.array([math.pi, math.radians(1.0), 0.05])
 ANY_DIRECTION_STD = math.pi / math.sqrt(3.0)
-"""Standard deviation [rad] of a direction that may be any, as before the robot drives."""
+"""Standard deviation of a direction of which nothing is known [rad], as before the robot drives: uniform on the
+circle."""
 
 LONGEST_GYRO_STEP_S = 1.0
 """Longest step between events [s]. A longer gap is cut into steps, so that the uncertainty grows within it."""
 
 LEAST_COURSE_STD_RAD = math.radians(0.05)
 ROUNDS, LONG_DELAY_S, LARGE_BIAS_RAD = 3, 0.15, math.radians(1.0)
+"""Largest number of linearisations, changes of the delay of the fixes [s] and of a window's turn by the bias [rad] from
+which on the courses are linearised again."""
+
 MOST_SWEEPS = 3
-"""A delay of the fixes up to this, and a bias that turns a window by this, are linear; larger ones take rounds."""
+"""Largest number of passes over the grids of noises."""
 
 MOST_EVENTS = 2000
 """Largest number of events that the likelihood is computed from."""
@@ -148,11 +152,11 @@ class HeadingEstimate:
 def estimate_heading(
     track: Track, turn: TurnRate, absolute: Sequence[AbsoluteHeading] = (), *, stands: bool = True
 ) -> HeadingEstimate | None:
-    """Estimate the heading; None with too few courses.
+    """Return the heading from turn rates, positions and absolute headings; None with too few courses over ground.
 
     Parameters
     ----------
-    turn : of a gyro, or of the wheels with a wide prior of its scale
+    turn : turn rate of a gyro, or of the wheels with a wide prior of its scale
     absolute : further headings
     stands : whether the rate is zero while the wheels stand
     """
@@ -252,7 +256,7 @@ class _Problem:
         return stated._replace(r=np.where(kind == COURSE, alike * of_course, white[kind] * stated.r))
 
     def model(self, noises: dict[str, float]) -> HeadingModel:
-        """Return start and process of the states."""
+        """Return the initial state and the process noise of the states."""
         count = len(self.absolute)
         std = np.concatenate([GYRO_STATE_PRIOR_STD, *(ABSOLUTE_PRIOR_STD for _ in range(count))])
         std[SCALE], std[BIAS] = self.turn.scale_std, self.turn.bias_std
@@ -298,13 +302,13 @@ class _Problem:
         return noises
 
     def _forward(self, noises: dict[str, float]) -> tuple[HeadingEvents, HeadingModel, HeadingPasses]:
-        """Run the filter with some noises; courses with a common error have less weight."""
+        """Run the filter for given noises; courses with a common error have less weight."""
         events, model = self.events(noises), self.model(noises)
         passes = filter_headings(events, model)
         # correlation of the errors of successive courses, from slip that the model lacks
         course = self.kind == COURSE
         z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
-        # the first ones find the states
+        # The first innovations are large because the states are not known yet.
         alike = float(long_run_factor(z[len(z) // 20 + 2 :, None])[0])
         if alike > 1.0:
             events = self.events(noises, alike)
@@ -317,7 +321,7 @@ class _Problem:
         return math.remainder(passes.x[-1, OFFSET], 2.0 * math.pi), math.sqrt(passes.P[-1, OFFSET, OFFSET])
 
     def solve(self, noises: dict[str, float]) -> HeadingEstimate:
-        """Return the estimate with some noises."""
+        """Return the estimate for given noises."""
         events, model, passes = self._forward(noises)
         states, covariances = smooth_headings(events, model, passes)
         del passes  # for a long log as large as the result of the pass below

@@ -122,14 +122,15 @@ OF_THE_SENSE = {"heading_convention_contradicts", "heading_convention_corrected"
 """Codes of findings about the sense of a heading. The offset is stated in the same finding."""
 
 EXPLAINED = 0.8
-"""Mean resultant length of angles above which they have one direction, and share of windows in reverse that turn
-about."""
+"""Mean resultant length of angles above which they have one direction. Also the share of the windows in reverse with a
+heading that is turned about, above which the heading is a course over ground."""
 
 UNEXPLAINED_RAD = math.radians(40.0)
-"""Scatter about the motion of wheels and fixes above which a heading is refused [rad]. With half of it, it is used."""
+"""Scatter about the motion of wheels and fixes above which a heading is refused [rad]. A heading with half of this
+scatter is used."""
 
 STUCK_S = 5.0
-"""Time for which a stuck heading is constant, at least [s]."""
+"""Shortest time for which a stuck heading is constant [s]."""
 
 STUCK_TURN_M = 0.3
 """Difference of the sides' distances in this time above which the robot turns [m]."""
@@ -190,7 +191,7 @@ def align_heading(
     log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseComparison, convention: Convention,
     derived: DerivedHeading | None,
 ) -> tuple[HeadingFacts, float, list[Note]]:  # fmt: skip
-    """Return offset and noise of the heading, and the correction.
+    """Return the facts about the heading: its offset, its noise and its correction.
 
     Parameters
     ----------
@@ -307,7 +308,7 @@ def _significant(offset: float, std: float) -> bool:
 
 
 def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseComparison) -> None:
-    """Raise where the heading follows the motion of wheels and fixes with no convention and no offset.
+    """Raise where no convention and no offset make the heading follow the motion of wheels and fixes.
 
     A heading of the other convention that the configuration keeps also scatters. It is used, with a warning.
     """

@@ -44,7 +44,7 @@ LEAST_ATTITUDE_STD_RAD = math.radians(0.01)
 
 
 def antenna_bearing(log: RobotLog, turn: TurnRate) -> AbsoluteHeading | None:
-    """Return the bearing from the chosen antenna to the furthest other one; None where none shows one."""
+    """Return the bearing from the chosen antenna to the furthest other antenna; None without a bearing."""
     mine, epoch = log.gnss, int(log.wheels.stamp_ns[0])
     best, baseline_m = None, 0.0
     for topic, other in ((receiver.topic, receiver.fixes) for receiver in log.other_receivers):
@@ -233,7 +233,7 @@ def _derived(
     """
     epoch, absolute = int(log.wheels.stamp_ns[0]), list[AbsoluteHeading]()
     if stated is not None:
-        # with the white noise that it shows relative to the turn rate
+        # The stated heading gets the white noise that it shows relative to the turn rate.
         measured = track.seen_heading_t
         attitude_cells = _averaged(measured, track.heading_at(measured), turn, ATTITUDE_CELL_S)
         step = np.diff(attitude_cells.heading - np.interp(attitude_cells.t, turn.t, turn.integrated))
@@ -280,7 +280,8 @@ def _derived(
 def known_again(t: Floats, std: Floats, holes: Floats) -> Bools:
     """Return which causal headings (n,) are known: not the first ones, nor those after a hole, while sigma is large.
 
-    Their errors are one error, that of the start or of the turn in the hole; the filter would take them for many.
+    The headings that are left out share one error: the error at the start, or the error of the turn in the hole. The
+    filter would treat it as many independent errors.
 
     Parameters
     ----------

@@ -225,7 +225,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
 
 
 APART_SHARE = 0.9
-"""A window is at least as long as this quantile of the distances from fix to fix."""
+"""Quantile of the distances from fix to fix. No window is shorter than this quantile."""
 
 
 def _apart_m(track: Track) -> float:
@@ -294,9 +294,9 @@ def check_streams(log: RobotLog) -> None:
     fastest = max(np.abs(values_of).max() for values_of in (wheels.left, wheels.right))
     farthest = max(np.abs(values_of).max() for values_of in (gnss.north_m, gnss.east_m))
     if fastest >= IMPOSSIBLE_MPS:
-        raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")
+        raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out speeds that no wheel can have")
     if farthest >= IMPOSSIBLE_M:
-        raise DataError(log.name, f"a position {farthest:.2g} m from the origin", "is it in its unit?")
+        raise DataError(log.name, f"a position {farthest:.2g} m from the origin", "are the positions in metres?")
     spans = {"wheel": wheels.stamp_ns, "position": gnss.stamp_ns, "heading": heading.stamp_ns}
     if max(int(s[0]) for s in spans.values()) >= min(int(s[-1]) for s in spans.values()):
         spans_text = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in spans.items())

@@ -1,4 +1,4 @@
-"""Positions that are mirrored: the sign of a latitude or longitude, or both exchanged, by a heading or a gyro alone."""
+"""Mirrored positions (a wrong sign of latitude or longitude, or both exchanged), found by a heading or a gyro alone."""
 
 from __future__ import annotations
 
@@ -77,12 +77,13 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
         return log
     near = [one for one, cost in zip(candidates, costs, strict=True) if cost < min(costs) + DECISIVE]
     if by_gyro:
-        # no heading decides between exchanges that fit alike: the path is the same, turned as a whole
+        # Without a heading nothing decides between exchanges that fit equally well: their paths differ by one turn
+        # only.
         what, right = " or ".join(words for _, words, _ in near), near[0][2]
         witnesses = "gyro and wheels, which agree"
         what += " (or the gyro is upside down, and the sides are exchanged)"
     else:
-        # of exchanges that fit alike the offset of the heading decides
+        # The offset of the heading decides between exchanges that fit equally well.
         _, what, right = min(near, key=lambda one: abs(one[0].offset_rad))
         witnesses = "gyro, heading and wheels, which agree"
     why = (
@@ -124,7 +125,7 @@ def _exchanged_by_distance(log: RobotLog, named: RobotLog) -> RobotLog:
 
 
 def _with_turned_heading(log: RobotLog) -> RobotLog:
-    """Return the log with a heading that its gyro with z up turns, from any begin; without one where none turns.
+    """Return the log with the integral of its gyro (z up) as heading, from any start; without a heading if none turns.
 
     The bias of the gyro is its rate where the wheels do not turn, by regression on their turn.
     """
@@ -136,7 +137,7 @@ def _with_turned_heading(log: RobotLog) -> RobotLog:
         if np.count_nonzero(finite) < FEWEST_OVERLAPPING or not np.ptp(apart[finite]) > 0.0:
             continue
         stamps, rate, apart = gyro.stamp_ns[finite], rate[finite], apart[finite]
-        # of equal differences, as of a robot that drives straight, the least norm is taken
+        # On a straight drive the regression has many solutions: the solution of least norm is taken.
         bias = np.linalg.lstsq(np.column_stack([apart, np.ones(len(apart))]), rate)[0][1]
         heading = trapezoids((stamps - stamps[0]) / 1e9, rate - bias)
         if np.ptp(heading) > LEAST_GYRO_TURN_RAD:
@@ -145,7 +146,7 @@ def _with_turned_heading(log: RobotLog) -> RobotLog:
 
 
 def _exchanges(log: RobotLog) -> list[tuple[str, RobotLog]]:
-    """Return what may be wrong with the positions of a log, in words, and the log without it."""
+    """Return the possible exchanges of a log's positions: each in words, with the log after it is undone."""
     if log.datum is None:
         mirrored = replace(log.gnss, east_m=-log.gnss.east_m, cov_north_east_m2=-log.gnss.cov_north_east_m2)
         return [("two axes are exchanged, or one has the other sign", replace(log, gnss=mirrored))]
@@ -201,4 +202,4 @@ EXCHANGES: tuple[tuple[str, Callable[[RobotLog, Datum], RobotLog | None]], ...] 
     ("the latitude has the other sign", _other_latitude),
     ("latitude and longitude are exchanged", _both_exchanged),
 )
-"""What may be wrong with geodetic positions, in words, and the log without it."""
+"""Possible exchanges of geodetic positions: each in words, with a function that undoes the exchange in a log."""

@@ -1,4 +1,4 @@
-"""Motion of the reference compared with the motion of the wheels, in windows of time; steps of it that are jumps.
+"""Motion of the reference compared with the motion of the wheels, in windows of time; jumps of the reference.
 
 The motion of the wheels is computed with the alignment's estimate. Place and turn are compared separately: for the
 place, wheel speeds are integrated along the measured heading; for the turn, they are integrated alone.
@@ -36,7 +36,7 @@ LONGEST_SAMPLE_HOLE_S = 0.6
 """Longest time between two samples without a hole [s]. No window spans a hole."""
 
 LONGEST_HELD_IN_USUAL = 2.0
-"""Ratio to the usual time for which a value is held above which the speed really was constant."""
+"""Time for which a wheel value is held, in usual times, above which the speed really was constant."""
 
 MOTION_WINDOW_M = 1.0
 """Shortest window for the estimate of the motion [m]. It is shorter than in the alignment, so that events disturb fewer
@@ -56,8 +56,8 @@ LEAST_DISTANCE2 = 36.0
 
 LEAST_MODEL_ERROR = 0.03
 FIRST_QUANTILE, LATER_QUANTILE = 0.7, 0.95
-"""Shares of the windows from which the model's error is computed: the first time, and later. The first time the windows
-still include events."""
+"""Quantiles of the windows' residuals from which the model's error is computed: in the first round, and in later
+rounds. In the first round the windows still include events."""
 
 NORMAL_QUANTILE = {FIRST_QUANTILE: 1.0364, LATER_QUANTILE: 1.9600}
 """Quantiles of the absolute value of a standard normal variable."""
@@ -124,7 +124,7 @@ class ComparedWindows(NamedTuple):
     ----------
     begin, end : (w,) rows of the knots
     ahead, aside, turned : (w,) reference minus model [m]; turns are multiplied by half the ICR separation
-    model_ahead, model_turned : (w,) by the wheels, likewise
+    model_ahead, model_turned : (w,) motion by the wheels, in the same units
     made : (w,) motion of the reference itself, the larger of displacement and turn [m]
     path_m : (w,) motion of the wheels [m], scale included
     sensor : (w, 3) variance that noise, held values and change of speed give ahead, aside, turned [m^2]
@@ -194,7 +194,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     return Knots(
         epoch_ns=int(wheels.stamp_ns[0]), track=track,
         variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2)[rows] / 2, USUAL_POSITION_STD_M**2),
-        # the noise is at most this
+        # The second differences give an upper bound of the noise, because they include motion.
         heading=heading, turn_variance=mad_std(np.diff(heading, 2), 0.0) ** 2 / 6,
         velocity=(v_left + v_right) / 2 * np.exp(1j * heading), apart=v_left - v_right,
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
@@ -326,7 +326,7 @@ STAMP_STD_S = 0.1
 
 
 def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Ints]:
-    """Return the knots without single outliers, and the rows before steps that may be jumps, which no window spans."""
+    """Return the knots without single outliers, and the rows before steps that may be jumps; no window spans them."""
     row = np.arange(len(knots.t))
     step, over = _beyond(knots, row[:-1], row[1:], width_m), _beyond(knots, row[:-2], row[2:], width_m)
     is_kept = np.ones(len(row), np.bool_)
@@ -355,12 +355,12 @@ def _beyond(knots: Knots, first: Ints, last: Ints, width_m: float) -> Bools:
 
 
 def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJump, ...]:
-    """Return the jumps of the reference among the steps that may be one.
+    """Return the jumps of the reference among the steps that may be jumps.
 
     Parameters
     ----------
     knots, first : of `without_jumps`
-    motion : that the wheels make
+    motion : motion by the wheels
     """
     last = first + 1
     windows = compare_with_wheels(knots, motion, first, last, 0.0)

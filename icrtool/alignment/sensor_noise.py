@@ -1,4 +1,4 @@
-"""The noise of fixes and headings: their steps against the motion of the wheels, and the noise that the filter uses."""
+"""The noise of fixes and headings, measured from their steps minus the motion of the wheels, for the filter."""
 
 from __future__ import annotations
 
@@ -32,17 +32,18 @@ JUMP_SIGMAS = 8.0
 SMALLEST_JUMP_M = 0.1
 PERSISTS_S = 1.0
 PERSISTS_SHARE = 0.5
-"""A jump is a step this far out of the usual, after which the fixes stay away for this long; an outlier comes back."""
+"""Smallest jump [m]; time for which the fixes stay away after a jump [s]; largest part of the jump that they come back
+in this time, as a share. After an outlier the fixes come back."""
 
 NOISIER = 1.5
 """Ratio of measured to stated noise above which the measured noise is used."""
 
 MOVES_MPS = 0.05
-"""Wheels on average faster than this: what delays and jitter of stamps add to the noise shows only then."""
+"""Mean wheel speed above which the robot moves [m/s]. Delays and jitter of stamps add noise only while it moves."""
 
 FROZEN_M, FROZEN_SHARE = 1.0, 0.5
-"""A fix that repeats the one before to the last digit while the wheels go this far is old. Where they do so on more
-than half of the distance, the robot does not move."""
+"""Distance of the wheels [m] after which a fix that equals the fix before to the last digit is old; largest share of
+the driven distance with old fixes. Above this share the robot does not move, and no fix is left out."""
 
 HOLE_IN_INTERVALS = 5.0
 """Interval between two samples, in usual intervals, above which a stream has a hole."""
@@ -52,14 +53,14 @@ WHEEL_HOLE_S = 1.0
 
 
 class FixSteps(NamedTuple):
-    """Steps between neighbouring fixes, north + j east, without what wheels and heading explain.
+    """Steps between neighbouring fixes, north + j east, minus the motion of wheels and heading.
 
     Attributes
     ----------
     step : complex (m - 1,) [m], NaN across a gap
-    product : (m - 2,) minus the product of neighbouring steps [m^2], NaN at gaps and wild steps: white noise of
-        variance s^2 an axis makes it 2 s^2 on average; what the wheels get wrong for longer makes it less
-    moves : bool (m - 1,), whether the wheels went on
+    product : (m - 2,) negative product of neighbouring steps [m^2], NaN at gaps and outliers. White noise with variance
+        s^2 on each axis gives 2 s^2 on average; errors of the wheels that last for several steps reduce it
+    moves : bool (m - 1,), whether the wheels moved
     jump_row : (j,) rows of the first fix after a jump
     """
 
@@ -69,7 +70,7 @@ class FixSteps(NamedTuple):
     jump_row: Ints
 
     def white_std_m(self, rows: Bools) -> float:
-        """Return the white noise of the fixes `rows` (m,), an axis [m]; NaN where there are too few steps."""
+        """Return the white noise of the fixes `rows` (m,) on one axis [m]; NaN where there are too few steps."""
         inside = rows[:-2] & rows[1:-1] & rows[2:] & np.isfinite(self.product)
         if np.count_nonzero(inside) < FEWEST_NOISE_STEPS:
             return float("nan")
@@ -93,7 +94,7 @@ class FixSteps(NamedTuple):
 
 
 def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Complexes) -> FixSteps:
-    """Compare each step between fixes with the motion of the wheels.
+    """Return the steps between fixes minus the motion of the wheels.
 
     Parameters
     ----------
@@ -136,17 +137,17 @@ def is_hole(interval_s: Floats, least_s: float = 1e-6) -> Bools:
 
 
 def unbroken_intervals(interval_s: Floats) -> Floats:
-    """Return intervals between wheel samples [s], zero for those that are too long to show what happened in them."""
+    """Return intervals between wheel samples [s], zero where an interval is too long to show the motion in it."""
     return np.where(is_hole(interval_s, WHEEL_HOLE_S), 0.0, interval_s)
 
 
 FIRST_FIXES, BAD_STEP_SPEEDS, BAD_STEP_M = 5, 3.0, 3.0
-"""Fixes before a step among the first ones are bad where it is longer than this many times what the wheels drive
-meanwhile, and more; and no later step is."""
+"""Largest number of first fixes that may be bad. They are bad if the step after them exceeds this multiple of the
+wheels' distance by more than the noise and this distance [m], and if no later step does."""
 
 
 def without_bad_start(log: RobotLog) -> RobotLog:
-    """Return a log without first fixes that lie apart from all others; the same log where none do."""
+    """Return a log without first fixes that lie apart from all others; the same log if there are none."""
     gnss, wheels = log.gnss, log.wheels
     if len(gnss.stamp_ns) < 4 * FIRST_FIXES or len(wheels.stamp_ns) < 2:
         return log
@@ -168,7 +169,7 @@ def without_bad_start(log: RobotLog) -> RobotLog:
 
 
 def without_frozen(log: RobotLog) -> RobotLog:
-    """Return a log without fixes that a driver sent again while its receiver had none; the same log where none is."""
+    """Return a log without old fixes, which a driver repeats while its receiver has none; else the same log."""
     gnss, wheels = log.gnss, log.wheels
     if log.datum is None or min(len(gnss.stamp_ns), len(wheels.stamp_ns)) < 2:
         return log
@@ -184,7 +185,7 @@ def without_frozen(log: RobotLog) -> RobotLog:
         return log
     keep = ~np.repeat(old, count)
     keep[first] = True
-    why = f"{np.count_nonzero(~keep)} fixes repeat the one before to the last digit while the wheels go on: left out"
+    why = f"{np.count_nonzero(~keep)} fixes repeat the fix before to the last digit while the wheels move: left out"
     return replace(log, gnss=gnss.cut(keep), notes=(*log.notes, note("fixes_frozen", why, log.name)))
 
 
@@ -203,7 +204,7 @@ LEAST_POSITION_STD_M, LEAST_HEADING_STD_RAD = 1e-4, math.radians(0.01)
 
 
 def unstated_position_std_m(settings: FilterConfig) -> float:
-    """Return the noise of fixes that state none [m]: as configured, else the usual."""
+    """Return the noise of fixes that state none [m]: the configured noise, else the usual noise."""
     return USUAL_POSITION_STD_M if settings.gnss_std_m == "auto" else settings.gnss_std_m
 
 
@@ -212,7 +213,7 @@ def fixes_of(gnss: PositionFixes, settings: FilterConfig, measured_m: float = ma
 
     Parameters
     ----------
-    measured_m : of `reference_noise`; a number is used throughout
+    measured_m : result of `reference_noise`; if it is not NaN, every fix has this noise
     """
     # The diagonal plus the covariance's size is never below the full matrix: correlated fixes are not overrated.
     correlated = np.nan_to_num(np.abs(gnss.cov_north_east_m2))
@@ -237,7 +238,7 @@ def fixes_of(gnss: PositionFixes, settings: FilterConfig, measured_m: float = ma
 def heading_variance(
     headings: HeadingSamples, settings: FilterConfig, at_least_rad: float = 0.0, measured_rad: float = math.nan
 ) -> Floats:
-    """Return the variances (h,) [rad^2], nowhere below `at_least_rad` squared; others as in `fixes_of`."""
+    """Return the variances of headings (h,) [rad^2], at least `at_least_rad` squared; the rest as in `fixes_of`."""
     usual_deg = USUAL_HEADING_STD_DEG if settings.heading_std_deg == "auto" else settings.heading_std_deg
     usual, floor = math.radians(usual_deg), math.radians(settings.heading_std_floor_deg)
     largest = LARGEST_SANE_HEADING_STD_RAD
@@ -248,7 +249,7 @@ def _variance(
     stated: Floats, settings: FilterConfig, usual: float, largest_sane: float, floor: float, measured: float,
     at_least: float,
 ) -> Floats:  # fmt: skip
-    """Return variances: what is measured, else in preset ``paper`` the usual, else what is stated, if that is sane."""
+    """Return variances: the measured one, else in preset ``paper`` the usual one, else the plausible stated ones."""
     if math.isfinite(measured):
         return np.full(stated.shape, max(measured, at_least) ** 2)
     if not settings.rules.measures_noise:
@@ -258,7 +259,7 @@ def _variance(
 
 
 def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn: FixSteps) -> tuple[float, float]:
-    """Return the measured noise of a reference's positions, an axis [m], and headings [rad]; NaN: take what is stated.
+    """Return the measured noise of a reference's positions on one axis [m] and of its headings [rad]; NaN: as stated.
 
     Parameters
     ----------
@@ -266,9 +267,9 @@ def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn
 
     Notes
     -----
-    For poses of a metric reference (motion capture, lidar, total station) that state no noise, where none is
-    configured. A receiver's fixes and an attitude sensor's headings step by less than they err, because they err alike
-    for seconds. Preset ``paper`` measures nothing.
+    The noise is measured for poses of a metric reference (motion capture, lidar, total station) that state no noise, if
+    no noise is configured. Errors of a receiver's fixes and of an attitude sensor's headings last for seconds, so that
+    the steps are smaller than the errors. Preset ``paper`` measures nothing.
     """
     free = settings.rules.measures_noise and settings.gnss_std_m == "auto" and log.datum is None
     place_stated, turn_stated = (
@@ -286,9 +287,9 @@ def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn
 
 
 def _measured(steps: FixSteps, values: Floats, least: float, usual: float) -> float:
-    """Return white noise [unit of the values (m,)], nowhere below what they resolve; NaN where hardly below the usual.
+    """Return the white noise of values (m,), at least their resolution; NaN if it is not well below `usual`.
 
-    Values in multiples of q err by q / sqrt(12), however little they step.
+    Values that are rounded to multiples of q have an error of q / sqrt(12), even if they do not change.
     """
     white = steps.white_std_m(np.ones(len(steps.step) + 1, np.bool_))
     between = np.diff(np.unique(values))

@@ -62,7 +62,7 @@ MOST_FALSE = 0.25
 """Largest ratio of windows that slip cannot explain to windows that show slip equally clearly."""
 
 RETURN_S, RETURNED_SHARE = 5.0, 0.5
-"""Time [s], and share of the missing motion that a reference must recover in it. Then the reference was wrong."""
+"""Time [s], and share of the missing motion. A reference that recovers this share within this time was wrong."""
 
 RETURN_SIGMAS = 5.0
 """Ratio of the missing motion to its noise from which on such a return is looked for."""
@@ -105,10 +105,11 @@ def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
 
     Notes
     -----
-    Windows of 0.5 to 2 s (longer where the fixes are noisy): displacement ahead and aside and turn, reference minus
-    model, over their standard deviations: noise of fixes and heading, wheel values held by the recorder, response time
-    at changes of speed, and the model's own error, a share of the distance, which is estimated from the log. The
-    squared Mahalanobis distance is chi-squared with 3 degrees of freedom.
+    Windows last 0.5 to 2 s, longer where the fixes are noisy. In each window, displacement ahead, displacement aside
+    and turn, reference minus model, are divided by their standard deviations. These contain the noise of fixes and
+    heading, wheel values held by the recorder, the response time at changes of speed, and the model's own error. The
+    model's error is a share of the distance and is estimated from the log. The squared Mahalanobis distance is
+    chi-squared with 3 degrees of freedom.
 
     A reference with more noise than stated shows too much motion in half of the windows, and too little in the other
     half. Slip cannot make a side move further than its wheels. Windows in which a side does are counted; if there are
@@ -157,7 +158,7 @@ def _find_events(
     whole = knots.holes[1:] == knots.holes[:-1]
     free, events = whole.copy(), list[SlipEvent]()
     tests = max(1.0, float(knots.t[-1] - knots.t[0]) / WINDOWS_S[0])
-    # the clearest first
+    # The window with the largest distance comes first.
     for at in np.argsort(-distance2, kind="stable"):
         core = slice(int(windows.begin[at]), int(windows.end[at]))
         if false_rate[at] > MOST_FALSE or not free[core].all():
@@ -324,7 +325,7 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
     t : (m,) [s] of the knots
     steps : (m - 1,) windows between neighbouring knots
     error : (3,) of the motion model, a share of the wheels' motion
-    usable : (m - 1,) steps that no hole and no other event takes
+    usable : (m - 1,) steps outside of holes and of other events
     core : rows of the steps of the window
     """
     span = core

@@ -36,10 +36,10 @@ def with_carried_heading(track: Track) -> Track:
 
     Notes
     -----
-    Between two measured headings the heading follows the wheels' turn, times one ratio of the whole drive; what is then
-    left at the measured headings is interpolated. The ratio maximises the mean cosine of the differences, as a turn
-    between two headings may be more than half a revolution (Fisher and Lee 1992, circular regression).
-    `Track.measured_t` holds the times of the measured headings.
+    Between two measured headings the heading follows the wheels' turn, times one ratio of the whole drive; the
+    remaining difference at the measured headings is interpolated. The ratio maximises the mean cosine of the
+    differences, as a turn between two headings may be more than half a revolution (Fisher and Lee 1992, circular
+    regression). `Track.measured_t` holds the times of the measured headings.
     """
     t, heading = track.heading_t, track.heading
     step = np.diff(t)
@@ -158,7 +158,7 @@ def _straight_turns(heading: HeadingSamples) -> tuple[Bools, Floats, bool]:
 
 
 def _bends(t: Floats, value: Floats) -> tuple[Floats, Floats]:
-    """Return how far each sample (n,) lies from the line between its neighbours, and half of their distance.
+    """Return the distance of each sample (n,) from the line between its neighbours, and half the neighbours' distance.
 
     The first and the last sample, and samples at a hole, are far from any line.
     """
@@ -175,7 +175,7 @@ def _bends(t: Floats, value: Floats) -> tuple[Floats, Floats]:
 
 
 def _nodes(bent: Bools, bend: Floats) -> Ints:
-    """Return rows of the nodes: of neighbours that are bent, as where no sample is a node itself, the most bent one."""
+    """Return the rows of the nodes: in each run of samples off the line, the sample that is furthest off."""
     rows = np.flatnonzero(bent)
     first = np.append(True, np.diff(rows) > 1)
     kept = [run[int(np.argmax(bend[run]))] for run in np.split(rows, np.flatnonzero(first)[1:])]

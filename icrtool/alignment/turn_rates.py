@@ -30,8 +30,8 @@ from icrtool.records.samples import GyroAxes
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
 ENOUGH_COURSES = 24.0
-"""Number of windows for which windows are shortened on a short drive. Otherwise the noise of the fixes sets the
-length."""
+"""Number of windows that a short drive is cut into, by shortening them. On a longer drive the noise of the fixes sets
+the length of the windows."""
 
 LARGEST_TURN_ERROR_RAD = 2.0
 """Largest turn of a window by the unknown bias and scale of the turn rate [rad]. With a larger one it is not used."""
@@ -41,7 +41,7 @@ FIXES_A_WINDOW = 5
 fixes most of the distance between windows would be lost."""
 
 MIDDLE_NOISE = 0.01
-"""Relative change of the sides' speeds by a turn below which it does not show the middle, even with exact courses."""
+"""Smallest spread of the sides' relative speed difference that shows `Guess.middle`, even with exact courses."""
 
 LONGEST_STRETCH_S = 60.0
 """Longest duration of two displacements, and longest time between them, to compare them without a turn rate [s]."""
@@ -181,7 +181,7 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
 
 
 def fit_middle(courses: Courses, guess: Guess) -> float:
-    """Return `Guess.middle` by the lengths of the courses: robust regression on the difference of the sides."""
+    """Return `Guess.middle` from the lengths of the courses: robust regression on the difference of the sides."""
     x, y = courses.of_middle, courses.length
     slope, weights = 0.0, np.ones(len(x))
     for _ in range(3):

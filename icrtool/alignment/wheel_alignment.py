@@ -47,7 +47,8 @@ USUAL_SCALE_STD = 0.04
 the drive the more likely case is taken. In the second case the correction is the posterior mean."""
 
 SMALLEST_SIDE_DIFFERENCE = 0.005
-"""Smallest relative difference of the sides that is corrected. Where both report one speed, such a robot veers."""
+"""Smallest relative difference of the sides that is corrected. A robot with such a difference veers where both sides
+report the same speed."""
 
 LARGEST_SCALE_CORRECTION = 0.15
 """Largest correction of a scale that tyres and soil explain."""
@@ -60,7 +61,8 @@ CONTRADICTED_SIGMAS, CONTRADICTED_SHARE = 3.0, 0.5
 deviations, and as a share of the wheels' distance, because speed and turn vary within a gap. Both must be exceeded."""
 
 FUSED_CORRELATION = 0.9995
-"""Correlation of the turn rates of wheels and gyro above which the former may have been computed from the latter."""
+"""Correlation of the turn rates of wheels and gyro above which the wheels' turn rate may have been computed from the
+gyro's."""
 
 FUSED_SLOPE = 0.003
 """Largest difference from 1 of the ratio of wheel turn to gyro turn that interpolation between stamps may cause."""
@@ -408,10 +410,10 @@ def find_filtering(fit: AlignmentFit) -> str:
     change, std = long.ratio - short.ratio, math.hypot(short.ratio_std, long.ratio_std)
     if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(EVIDENCE_SIGMAS * std, SMALLEST_CHANGE * long.ratio):
         ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {short_s:g} s and {long.ratio:.2f} ± "
-        return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of what they show"
+        return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of the turn that they show"
     at_middle, at_end = (math.sqrt(max(one.residual_rad**2 - noise.residual_rad**2, 0.0)) for one in (middle, long))
     least = max(LARGE_SHARE * short.turn_rad, LARGE_RAD)
     if at_middle > least and at_end < BOUNDED * at_middle:
         angles = f"{math.degrees(at_middle):.0f}° over {middle_s:g} s and by no more than {math.degrees(at_end):.0f}°"
-        return f"their turn differs from the robot's by {angles} over {long_s:.0f} s, which slip would add up"
+        return f"their turn differs from the robot's by {angles} over {long_s:.0f} s; slip would add up"
     return ""

@@ -45,8 +45,8 @@ SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
 that is the usual one. Such a single sample is not a motion of the robot."""
 
 GAP_IN_USUAL, FASTER = 2.5, 1.5
-"""Positions that change in a gap, this many usual intervals long, this many times faster than in almost all other
-intervals began again: the base restarted."""
+"""Shortest gap, in usual intervals, and smallest ratio of the speed in the gap to the speed in almost all other
+intervals, at which wheel positions began again because the base restarted."""
 
 PARKED_M, PARKED_SIGMAS, TURNING_SHARE = 0.5, 3.0, 0.2
 """Radius within which 95 % of a standing robot's positions lie, in metres and in their standard deviations, and
@@ -58,11 +58,13 @@ size by less."""
 
 
 OTHER_UNIT_TOLERANCE = 0.1
-"""The same difference for another unit than the message type's. It is smaller: slip of 90 % would look like rpm."""
+"""The same difference for another unit than the message type's. It is smaller, because slip of 90 % would look like
+rpm."""
 
 
 FACTOR_TWO_TOLERANCE = 0.08
-"""Largest relative difference of a scale from 2 or 1/2, diameter for radius, at which it is that factor."""
+"""Largest relative difference of a scale from 2 or 1/2 at which the scale is that factor: a diameter was used as a
+radius, or the reverse."""
 
 LARGEST_SIZE_STD = 0.04
 """Largest standard deviation of the factor of a wrong wheel size, as a share of it. Slip that varies gives a
@@ -82,7 +84,7 @@ class Scale(NamedTuple):
 
 
 def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
-    """Return the log with wheel speeds in m/s; the same log where its speeds are ready to use.
+    """Return the log with wheel speeds in m/s; the same log if its speeds are in m/s already.
 
     Speeds that no wheel can have are left out. The unit that was used or estimated is stated in the stream's ``why``
     and in the findings.
@@ -138,7 +140,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
 
 
 def with_right_size(log: RobotLog, config: Config) -> tuple[RobotLog, float]:
-    """Return the log with wheel speeds of the right size, and the factor they were multiplied with; 1 for none.
+    """Return the log with wheel speeds of the right size, and the factor that was applied; 1 for none.
 
     A constant factor that tyres and soil do not explain is the factor of a wrong radius, resolution, gear or unit: slip
     is not the same in every span. Configured scales are left as they are.
@@ -195,13 +197,14 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
 
     Parameters
     ----------
-    windows : of the log. Without them the robot stands if its positions stay within their noise; this is for logs that
-        show no heading or no unit, like logs of a robot on a stand. A robot that spins on the spot may show them
+    windows : of the log. Without windows the robot stands if its positions stay within their noise. A log of a robot on
+        a stand has no windows, because it shows no heading or no unit; a log of a robot that spins on the spot may have
+        windows
 
     Raises
     ------
     DataError
-        The robot does not move; or far less than the wheels.
+        The robot does not move, or moves far less than its wheels.
     """
     gone = ""
     laid_m = went_m = 0.0
@@ -243,7 +246,7 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
 
 
 def _restarts(stamps: Ints, left: Floats, right: Floats) -> Bools:
-    """Return after which samples (n,) positions began again: a gap whose mean speed no other interval has nearly.
+    """Return the samples (n,) after which positions began again: the speed in the gap is far above almost all others.
 
     A robot is on average no faster in a gap than its fastest samples.
     """
@@ -317,7 +320,7 @@ def _metres_per_unit(
         # the units in which drivers fill speeds of joints
         for other, value in (("m/s", 1.0), ("rpm", 2 * math.pi * radius / 60), ("deg/s", math.radians(radius))):
             if scale is not None and far and abs(math.log(scale.value / value)) < OTHER_UNIT_TOLERANCE:
-                why = f"{topic} is read in {other}, not rad/s: the position reference goes as far as that"
+                why = f"{topic} is read in {other}, not rad/s: the position reference goes as far in this unit"
                 return value, f" in {other} (by the position reference)", [note("wheel_unit_found", why)]
     if unit in metres_by_unit:
         return metres_by_unit[unit], "" if unit == "m" else f" in {unit}{per}", []
@@ -351,7 +354,7 @@ def _metres_per_unit(
 
 
 def _recognised(scale: Scale, known: Mapping[WheelUnit, float], radius: float | None) -> tuple[str, float] | None:
-    """Return the unit, and its metres, that the position reference confirms; None for none.
+    """Return the unit that the position reference confirms, and its length [m]; None where it confirms no unit.
 
     Parameters
     ----------

@@ -352,7 +352,7 @@ def test_fixes_that_a_driver_repeats_while_the_receiver_has_none_are_left_out() 
     gnss = log.gnss
     north, east = gnss.north_m[kept], gnss.east_m[kept]
     frozen = fit(replace(log, gnss=replace(gnss, north_m=north, east_m=east)), CONFIG)
-    assert any("repeat the one before" in note for note in frozen.warnings)
+    assert any("repeat the fix before" in note for note in frozen.warnings)
     assert icrs(frozen) == pytest.approx(icrs(fit(log, CONFIG)), abs=ICR_TOLERANCE_M)
     stands = replace(log, gnss=replace(gnss, north_m=0.0 * gnss.north_m, east_m=0.0 * gnss.east_m))
     assert without_frozen(stands) is stands
