@@ -49,8 +49,8 @@ def fit(
     Returns
     -------
     Run
-        No file is touched. `document` holds the motion model, as `icrtool.calibrate` fits it, the ICRs and what a
-        controller is given.
+        The run; no file is written. Its `document` holds the motion model that `icrtool.calibrate` fits, the ICRs, and
+        the numbers for a controller.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def fit_log(
 
     Parameters
     ----------
-    warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
+    warm_start : final ICRs of another run with their covariance (Fig. 18), in place of the preset's start
     watch : called with the name of each stage when it begins
 
     Raises
@@ -99,7 +99,7 @@ def fit_log(
 
 
 def _giving_back(watch: Watch) -> Watch:
-    """Return what gives back freed memory at the begin of each stage, and then calls `watch`."""
+    """Return a function that gives back freed memory at the begin of each stage, and then calls `watch`."""
 
     def begin(stage: str) -> None:
         give_back_freed()
@@ -121,7 +121,7 @@ def fit_into(
     share: Callable[[float], None] | None = None,
     note: Callable[[str], None] | None = None,
 ) -> Iterator[tuple[Run, Path]]:
-    """Fit a log, write its run, and give the run and its new directory, which is put in place at the end of the block.
+    """Fit a log, and yield its run and the new directory, which is put in place at the end of the block.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def fit_into(
 
 
 def _warm_start(source: Path | None, config: Config, note: Callable[[str], None] | None) -> WarmStart | None:
-    """Return the ICRs that a run ended with, or those of a calibration file; note where its track width is another."""
+    """Return the final ICRs of a run, or the ICRs of a calibration file; note where its track width differs."""
     if source is None:
         return None
     from icrtool.output.files.formats import open_calibration

@@ -21,7 +21,7 @@ from icrtool.motion.window_fit import Prediction
 def prior_for(
     recording: Recording, calibrations: Sequence[Calibration] = (), *, refit_sensors: bool = False
 ) -> TermsPrior:
-    """Return what is known before a recording: of calibrations the first one not fitted to it, else of robots.
+    """Return the prior for a recording: from the first calibration not fitted to it, else from other robots.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class KnownDrive:
         return errors
 
     def path(self, start: int, end: int, *, turned: bool = False) -> OpenLoopPath:
-        """Return the path from one state to another, with what was known at the first one."""
+        """Return the path from one state to another, with the model that was known at the first state."""
         one = np.array([start], np.int64)
         ((number, _),) = self._by_learned(one)
         steps = self._steps_around(one, np.array([end], np.int64))
@@ -95,7 +95,7 @@ class KnownDrive:
         return self.recording.wheels(track.rows_around(*span)) if self.steps is None else self.steps.around(*span)
 
     def _by_learned(self, starts: Ints) -> Iterator[tuple[int, slice]]:
-        """Yield the number of what was known, and the starts (ascending) from which on it was."""
+        """Yield rows of the starts (ascending), and the number of the item of `learned` that was known at them."""
         known_s = np.array([one.t_s for one in self.learned])
         number = np.searchsorted(known_s, self.recording.track.t[starts], side="right") - 1
         first = np.flatnonzero(np.diff(number, prepend=-1))
@@ -108,7 +108,7 @@ class KnownDrive:
 
 
 def adapt(recording: Recording, prior: TermsPrior, past: Recording | None = None) -> KnownDrive:
-    """Let `AdaptiveModel` drive a recording, with its gyro where it has one.
+    """Return a recording with what `AdaptiveModel` learns along it, with its gyro where it has one.
 
     Parameters
     ----------
@@ -119,5 +119,5 @@ def adapt(recording: Recording, prior: TermsPrior, past: Recording | None = None
     learned = [model.now._replace(t_s=-np.inf)]
     for lo in range(0, len(recording.track.t), ROWS_AT_ONCE):
         learned += model.observe_all(samples_of(past, slice(lo, lo + ROWS_AT_ONCE)))
-    # the shortest steps, however long the log is: its end must not change what is predicted before
+    # The steps are the shortest for a log of any length, because its end must not change earlier predictions.
     return KnownDrive(recording, tuple(learned), steps_of(recording, 0.0))

@@ -57,14 +57,14 @@ def calibrated_drive(
     with_gyro: bool = False,
     refit_sensors: bool = False,
 ) -> CalibratedDrive:
-    """Return a calibration in a recording.
+    """Return a calibration with the constants of its sensors, ready to be tested in a recording.
 
     Parameters
     ----------
     row : name of its row
     past : the recording with the poses that were known when it was driven; default: its own
     with_gyro : with the recording's gyro
-    refit_sensors : the constants are those of the whole recording, and none are held
+    refit_sensors : all constants are fitted to the whole recording; no constant is held
 
     Raises
     ------
@@ -91,7 +91,7 @@ def calibrated_drive(
         return CalibratedDrive(KnownDrive(recording, (_learned(fitted, own_values),)), sensors, knows, ())
     remaining = remaining_constants(total, recording.corrected)
     unknown = [name for name in names if getattr(sensors.held, name) is None]
-    # a model without a gyro uses no constants of it
+    # A model without a gyro uses no constants of a gyro.
     constants = remaining.usual().mean
     if unknown:
         constants = own_constants(cut_windows(recording), fitted, recording.width_m, remaining.mean)
@@ -130,7 +130,7 @@ def _with_biases(
 
     Parameters
     ----------
-    constants : its bias is the bias before the drive; `std_radps` : standard deviation of that
+    constants : its bias is the bias before the drive; `std_radps` : its standard deviation
     """
     path = predicted_path(past, fitted, constants)
     lines = past_lines(past.track, lambda rows: path(past.track.t[rows])[0], (0.0, std_radps))

@@ -201,7 +201,7 @@ def solve_nonnegative(matrix: Floats, y: Floats) -> Floats:
 
     Notes
     -----
-    Of all 2^n choices of which values are above zero, the best solution without a negative value.
+    All 2^n choices of the values above zero are solved. The best solution without a negative value is returned.
     """
     size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
     scaled, target = matrix / np.outer(size, size), y / size
@@ -219,7 +219,7 @@ class Forecast(NamedTuple):
 
     Attributes
     ----------
-    distance_m : driven; east_m, north_m : where the path is then
+    distance_m : driven distance; east_m, north_m : position on the path there
     expected_m, p95_m : mean error, and the distance within which 95 % of the errors are
     std_east_m, std_north_m, heading_std_deg : one standard deviation
     """
@@ -311,7 +311,7 @@ def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Float
 
 
 def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: bool) -> Forecast:
-    """Return the forecast after each metre of a track, and of its wheel samples as they are integrated."""
+    """Return the forecast after each metre of a track; `steps` are its wheel samples as they are integrated."""
     metres = np.arange(1.0, np.floor(track.distance[-1]) + 1.0)
     if not len(metres):
         raise DataError("path", f"{track.distance[-1]:.2f} m long", "a forecast needs a metre at least")

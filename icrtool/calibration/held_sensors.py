@@ -85,7 +85,7 @@ def known_constants(document: documents.SensorConstants) -> KnownConstants:
 def pooled_constants(
     logs: Sequence[documents.CalibrationLog], heading_source: str | None = None, *, with_gyro: bool = False
 ) -> KnownConstants:
-    """Return what the logs of a calibration give for the constants of a further drive; NaN where they give nothing.
+    """Return the constants that the logs of a calibration predict for a further drive; NaN where they predict none.
 
     Parameters
     ----------
@@ -95,9 +95,9 @@ def pooled_constants(
 
     Notes
     -----
-    The mean of the logs, weighted by their variances and the variance between drives; the standard deviation is that of
-    a further drive. The variance between drives is the variance of the logs beyond their own uncertainty
-    (`between_variance`), pooled with `BETWEEN_DRIVES_STD`, which stands alone for one or two logs.
+    The value is the mean of the logs, weighted by their variances and the variance between drives. The standard
+    deviation holds for a further drive. The variance between drives is the variance of the logs beyond their own
+    uncertainty (`between_variance`), pooled with `BETWEEN_DRIVES_STD`, which stands alone for one or two logs.
     """
     stored = [one.sensors for one in logs if one.sensors is not None]
     sources = {one.heading_source for one in stored}
@@ -122,7 +122,7 @@ def pooled_constants(
 
 
 def _further(found: Floats, usual_std: float) -> tuple[float, float]:
-    """Return mean and standard deviation of a further drive, from those of drives (k, 2)."""
+    """Return mean and standard deviation of a further drive, from the values and deviations of drives (k, 2)."""
     (values, std), usual = found.T, usual_std**2
     variances, between = std**2, usual
     if len(values) >= FEWEST_POOLED:

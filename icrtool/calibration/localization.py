@@ -1,7 +1,7 @@
 """Numbers of a drive for `robot_localization`: covariances, process noise, heading offset, place of the antenna.
 
 Frames of REP-103: x forward, y left, yaw counter-clockwise from east. Every number has its source, and its standard
-deviation where one is known; what the drive does not show is named.
+deviation where one is known; numbers that the drive does not show are listed with the reason.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class AntennaPlace(NamedTuple):
 
 
 class Localization(NamedTuple):
-    """What `robot_localization` is given.
+    """Numbers for the parameters of `robot_localization`.
 
     Attributes
     ----------
@@ -126,7 +126,8 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
 
     Notes
     -----
-    The filter adds REFERENCE_STEP_S dt sigma^2 in dt (Pentzer 2014, Eq. 30, at any rate), robot_localization dt Q.
+    In a time dt the filter adds the variance REFERENCE_STEP_S dt sigma^2 (Pentzer 2014, Eq. 30, for any sample rate),
+    and robot_localization adds dt Q.
     """
     used, settings, configured = run.document.filter, run.config.filter, configured_noise(run.config)
     estimates: dict[str, Estimate] = {}

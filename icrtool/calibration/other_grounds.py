@@ -37,8 +37,8 @@ def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -
 
     Returns
     -------
-    Empty for fewer than `FEWEST_GROUNDS`. A ground without trials, or without which too short a drive is left, has no
-    score.
+    The scores; none for fewer than `FEWEST_GROUNDS` grounds. A ground has no score if it has no trials, or if the other
+    grounds together are too short a drive.
     """
     scores: list[GroundScore] = []
     names = list(dict.fromkeys(grounds))
@@ -86,7 +86,7 @@ def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit])
 
 
 def _held(recording: Recording, trials: Trials, fitted: FittedModel, constants: LogConstants) -> Floats:
-    """Return the errors (k, h) [m] of a model that is held as it is."""
+    """Return the errors (k, h) [m] of a model that is not fitted again."""
     return errors_without(
         recording, trials, [Fold("", 0, 0, -np.inf, np.inf)], 0, lambda _: (fitted, constants)
     ).position
@@ -95,7 +95,7 @@ def _held(recording: Recording, trials: Trials, fitted: FittedModel, constants: 
 def other_ground_ends(
     scores: Sequence[GroundScore], row: str, budget_m: float
 ) -> tuple[float | None, float | None] | None:
-    """Return between which distances [m] a row stays within a budget on a ground that is not among those left out.
+    """Return the interval of the distance [m] at which a row stays within a budget on a further ground.
 
     Parameters
     ----------

@@ -128,7 +128,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         return names if len(self.logs) == 1 else f"{len(self.logs)} logs ({names})"
 
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
-        """Return p95 and expected error [m] of all held-out trials of a model together, NaN without one."""
+        """Return p95 and expected error [m] of all held-out trials of a model together, NaN without trials."""
         for one in self.held_out_pooled:
             if one.model == model and one.horizon_m == horizon_m:
                 return one.p95_m, one.expected_m

@@ -48,7 +48,7 @@ FINDING_KINDS = {
     "right_scale": _Kind("right wheel scale", 0.01),
     SEPARATION: _Kind("ICR separation y right − y left", 0.05),
 }
-"""By their keys in files."""
+"""Words, useful standard deviation and name of each parameter, by its key in files."""
 
 WEAK = 3.0
 """Largest ratio of a standard deviation to the useful one that counts as weak. Above it the parameter is not shown."""
@@ -161,7 +161,7 @@ def _reason(key: str, driven: documents.SensorDrive) -> str:
 def _derive(
     run: Run, direct: Mapping[str, documents.SensorParameter], x_icr_m: float | None
 ) -> dict[str, documents.SensorParameter]:
-    """Return the places of antenna and ICRs that follow from the known one; unless known, the ICRs' middle is y = 0."""
+    """Return the positions of antenna and ICRs, from the known one of both; by default the ICRs' middle is y = 0."""
     of_antenna_and_icrs = [direct[key] for key in (ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION)]
     (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, of_antenna_and_icrs)
     of_ahead, of_aside, of_separation = (one.verdict for one in of_antenna_and_icrs)

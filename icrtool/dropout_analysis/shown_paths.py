@@ -51,7 +51,8 @@ FIXES_COMPARED_S = 1.0
 class StartErrors(NamedTuple):
     """The end errors of the trials of one length, of the row `name`, and the states at which they end.
 
-    `error_m` (n,): by the state at which a trial starts, NaN where none does; `end` (n,)
+    `error_m` (n,) [m] and `end` (n,) have an entry for each state at which a trial may start; an error is NaN where no
+    trial starts.
     """
 
     name: str
@@ -73,7 +74,7 @@ class StartErrors(NamedTuple):
 def errors_by_start(
     run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, *, starts: Starts = "moving"
 ) -> StartErrors:
-    """Return the error of each trial of one length, of row ``recommended``, without it of the momentary ICRs.
+    """Return the error of each trial of one length: of row ``recommended``, or if it is missing, of the momentary ICRs.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ def worst_trials(
     ----------
     compared, horizon_m, starts : as in `errors_by_start`
     further : further rows whose paths are shown
-    errors : what `errors_by_start` returns, where it is known
+    errors : result of `errors_by_start`, if it was computed before
     """
     of_starts = errors_by_start(run, compared, horizon_m, starts=starts) if errors is None else errors
     track, models, ends = track_of(run), models_of(run), of_starts.end

@@ -111,7 +111,8 @@ def _errors(poses: TopicPoses, t: Floats, track: Track, trials: Trials) -> Trial
 
     Notes
     -----
-    The translation part of the relative pose error of Sturm et al. (2012), and the angle of its rotation part.
+    The errors are the translation part of the relative pose error of Sturm et al. (2012), and the angle of its rotation
+    part.
     """
     errors = TrialErrors.none(trials.ends.shape)
     for h in range(trials.ends.shape[1]):
@@ -158,7 +159,7 @@ def _compared_rows(track: Track, covered: np.ndarray) -> Ints:
 
 
 def _departure(place: Complexes, reference: Complexes, distance: Floats) -> Departure | None:
-    """Return the departure of places (n,) from a reference (n,), at distances (n,) [m]; None of too few."""
+    """Return the departure of places (n,) from a reference (n,), at distances (n,) [m]; None for too few places."""
     if len(place) < FEWEST_COMPARED:
         return None
     parts = np.searchsorted(distance, distance[0] + (distance[-1] - distance[0]) * np.arange(1, PIECES) / PIECES)

@@ -151,7 +151,7 @@ def _sparse_starts(standing: Bools) -> Ints:
 
 
 def _at_all_starts(errors: Floats, starts: Ints, states: int) -> Floats:
-    """Return errors (n, h) by all states of errors (k, h) of some starts; NaN at the others."""
+    """Return the errors (k, h) of some starts in rows of all states (n, h); NaN in the other rows."""
     whole = np.full((states, errors.shape[1]), np.nan)
     whole[starts] = errors
     return whole
@@ -204,7 +204,7 @@ def _statistics(
     ----------
     of_few : errors of its turns and errors with aligned start headings, at all horizons
     columns : of `of_few`, the horizons of `errors`
-    each : as `map`
+    each : applies a function to each horizon, as `map` does
     """
     turned, aligned = of_few.heading.T[columns], of_few.aligned.T[columns]
     at_each = partial(_at_horizon, row_of(model.name).spread)

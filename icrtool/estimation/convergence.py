@@ -1,4 +1,4 @@
-"""When a filter had learned its ICRs: by the estimates (Pentzer 2014, Section 5.2), or by their standard deviations."""
+"""Convergence times of the ICRs of a run: from the estimates (Pentzer 2014, Section 5.2), or from their deviations."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
     dict
         By column: time [s] at which the estimate has made 10 % of the change from its start to its settled value
         (median over the second half of the run), and time from which on it stays within 10 % of that change for
-        `ARRIVED_S`; None where it never settles. Of an estimate that starts near its settled value, so that 10 % of
-        the change are less than the standard deviation it has there, the times at which its standard deviation has
-        made 10 and 90 % of its fall; None where that is less than half.
+        `ARRIVED_S`; None where it never settles. For an estimate that starts near its settled value (10 % of the change
+        is less than its settled standard deviation), the times at which its standard deviation has made 10 % and 90 %
+        of its decrease; None if it decreases by less than half.
 
     Notes
     -----
@@ -64,12 +64,13 @@ def _span(t_s: Floats, estimate: Floats, std: Floats) -> tuple[float, float] | N
 
 
 def fallen_at(std: Floats, share: float = LEARNED_SHARE) -> int | None:
-    """Return the first state at which a standard deviation (n,) has made a share of its fall; None where it has none.
+    """Return the first state at which a standard deviation (n,) has made a share of its decrease; None without one.
 
     Notes
     -----
-    It falls from s_0 at the first state to s_f, its median over the second half of the states, and has made the share
-    at the first state with s <= s_f + (1 - share) (s_0 - s_f). None where s_f exceeds half of s_0 (`LEAST_FALL`).
+    The standard deviation decreases from s_0 at the first state to s_f, its median over the second half of the states.
+    It has made the share at the first state with s <= s_f + (1 - share) (s_0 - s_f). None where s_f exceeds half of s_0
+    (`LEAST_FALL`).
     """
     first, final = float(std[0]), float(np.median(std[len(std) // 2 :]))
     if final > (1.0 - LEAST_FALL) * first:
@@ -78,17 +79,18 @@ def fallen_at(std: Floats, share: float = LEARNED_SHARE) -> int | None:
 
 
 def icr_std_m(run: Run, column: IcrColumn) -> Floats:
-    """Return the standard deviation (n,) of an ICR [m] at each recorded state; it ends at ``final_std`` of run.json.
+    """Return the standard deviation (n,) of an ICR [m] at each recorded state; the last is ``final_std`` of run.json.
 
     It is the filter's own (states.csv) where the drive does not show the ICR.
 
     Notes
     -----
-    The filter counts what it has learned with its process noise; ``final_std`` counts it by the differences between
-    stretches of the drive (`icrtool.estimation.observability.final_covariance`). With the filter's variance P(t), the
-    information that it has gained since the start is 1/P(t) - 1/P(0). One factor on it gives ``final_std`` at the end.
-    The start stays as configured, and the part of the clocks in x is added. Where the filter knows no more
-    at the end than at the start (a warm start), the difference of the variances, or their ratio, is applied instead.
+    The filter's variance follows from its process noise; ``final_std`` follows from the differences between stretches
+    of the drive (`icrtool.estimation.observability.final_covariance`). With the filter's variance P(t), the information
+    that it has gained since the start is 1/P(t) - 1/P(0). This information is multiplied by one factor, so that the
+    last value is ``final_std``. The start stays as configured, and the part of the clocks in x is added. Where the
+    filter knows no more at the end than at the start (a warm start), the difference of the variances, or their ratio,
+    is applied instead.
     """
     own: Floats = np.asarray(getattr(run.table, f"std_{column}"), np.float64)
     final = run.document.icr.final_std[column]

@@ -295,7 +295,7 @@ def initial_icrs(config: Config) -> IcrStart:
 
 
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
-    """Return the interval between wheel samples [s] above which they are a gap: never less than a few samples."""
+    """Return the interval between wheel samples [s] above which there is a gap: at least a few usual intervals."""
     return max(config.filter.wheel_gap_s, WHEEL_GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
 
 

@@ -82,7 +82,7 @@ BRIDGED = 0.25
 def followed_jumps(
     sensors: SensorData, gnss: MeasurementOutcome, heading: MeasurementOutcome
 ) -> tuple[ReferenceJump, ...]:
-    """Return the jumps that the reference of the trials makes, the filter's states, in order of time.
+    """Return the jumps of the filter's states, which are the reference of the trials, in order of time.
 
     Parameters
     ----------

@@ -143,7 +143,7 @@ def final_covariance(
 
     Parameters
     ----------
-    windows : with the final ICRs; y right - y left is the prior's standard deviation, too
+    windows : with the final ICRs; y right - y left is also the prior standard deviation
     filter_covariance : (3, 3) of the ICRs at the end; with the process noise it gives the filter's memory
     process_icr_mps : process noise of the filter
     track_width_m : b; None: not known

@@ -191,8 +191,8 @@ LONGEST_GYRO_HOLE_S = 1.0
 def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
     """Yield the headings measured independently of the position reference, a gyro's before an attitude sensor's.
 
-    A heading that needs positions (estimated, or a field of the position's messages) is left out, and a heading that
-    does not cover the run.
+    A heading is left out if it needs positions (it was estimated, or it is a field of the position's messages), or if
+    it does not cover the run.
     """
     sensors = run.sensors
     stamps = run.table.stamp_ns

@@ -1,6 +1,6 @@
-"""The filter stage: from aligned sensors to recorded states (Pentzer 2014, Section 3), and these smoothed.
+"""The filter stage: from aligned sensors to recorded states (Pentzer 2014, Section 3), and the smoother over them.
 
-It runs with the process noise of the pose that the innovations of the log show.
+The filter runs with the process noise of the pose that the innovations of the log show.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def _check_motion(sensors: SensorData) -> None:
 
 
 def set_up_again(run: Run, outages_ns: tuple[tuple[int, int], ...] = ()) -> FilterSetup:
-    """Prepare the filter run that gave `run`, to smooth it, or to take GNSS and heading away in some spans."""
+    """Return the set-up of the filter run that gave `run`, for the smoother or for forced outages."""
     return set_up_filter(
         run.sensors,
         run.config,
@@ -354,8 +354,8 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:
     """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns].
 
-    A fix that the gate rejected moves no filter and ends no outage. Where RTK was lost, the fixes there do not count:
-    the filter drove on with its wheels.
+    A fix that the gate rejected does not move the filter, and does not end an outage. Where RTK was lost, the fixes
+    there do not count: the filter drove on with its wheels.
     """
     lost = np.zeros(len(gnss.stamp_ns), np.bool_)
     for begin, end in rtk_losses_ns:

@@ -118,7 +118,7 @@ def unusable_reasons(
 
 
 def _why_turns_unexplained(wheels: WheelFacts | None) -> str:
-    """Return that the wheels do not show the turns; empty where they explain most of their variance, or may."""
+    """Return why the turns are not explained; empty where the wheels explain most of their variance, or may do so."""
     slip = "do they slip, as on ice?"
     if wheels is None or wheels.turn_unexplained is None or wheels.turn_unexplained_std is None:
         return f"the wheels explain almost none of the turns: {slip}"

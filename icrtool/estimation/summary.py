@@ -201,7 +201,7 @@ def _notes(
 
 
 def filter_summary(measurements: Measurements, filtered: Filtered, config: Config) -> FilterDocument:
-    """Return the settings of the filter, and the statistics of its innovations over measurements not gated.
+    """Return the settings of the filter, and the statistics of the innovations of accepted measurements.
 
     If the noise is right, the mean NIS is 2 for fixes and 1 for headings.
     """
