@@ -16,7 +16,7 @@ Bytes = NDArray[np.uint8]
 
 
 def trapezoids(t: Floats, rate: Floats) -> Floats:
-    """Return the integral of a rate (n,) from the first of its times (n,) until each, by trapezoids."""
+    """Return the integral of a rate (n,) from its first time until each of its times (n,), by trapezoids."""
     sums = np.zeros(len(t))
     steps = sums[1:]
     np.add(rate[:-1], rate[1:], out=steps)
@@ -38,7 +38,7 @@ def unwrapped(angle: Floats) -> Floats:
 
 
 ROWS_AT_ONCE = 1 << 16
-"""Rows that are processed at once: the number bounds the memory."""
+"""Number of rows that are processed at once. It bounds the memory."""
 
 
 def rows_at_steps(progress: Floats, step: float) -> Ints:
@@ -59,7 +59,7 @@ def rows_at_steps(progress: Floats, step: float) -> Ints:
 
 
 def rows_of_cells(progress: Floats, cells_of: Callable[[Floats], Floats]) -> Ints:
-    """Return the first row of each cell, from 0 on, of values that never decrease; `cells_of` gets parts of them."""
+    """Return the first row of each cell, from 0 on, of values that never decrease; `cells_of` takes parts of them."""
     parts, last = [np.empty(0, np.int64)], -1.0
     for lo in range(0, len(progress), ROWS_AT_ONCE):
         cell = cells_of(progress[lo : lo + ROWS_AT_ONCE])
@@ -88,7 +88,7 @@ def quaternion_product(a: Floats, b: Floats) -> Floats:
 
 
 def turned_axis(axis: int, x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return x, y, z (n,) of an axis (0, 1, 2) of frames turned by unit quaternions, in the frame around."""
+    """Return x, y, z (n,) of an axis (0, 1, 2) of frames turned by unit quaternions, in the fixed frame."""
     if axis == 0:
         return 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
     if axis == 1:

@@ -59,7 +59,7 @@ _DEBUGGING = ("NUMBA_BOUNDSCHECK", "NUMBA_DEBUGINFO")
 """Settings of numba with which machine code is slower: it is not kept for later processes."""
 
 _RETURNED = (0, -2)
-"""What machine code returns where it raised no exception: it has a result, or None."""
+"""Status codes of machine code that raised no exception: with a result, and with None."""
 
 _watchers: list[Callable[[], None]] = []
 """Called when numba begins to compile a kernel, which happens once on a computer."""
@@ -74,7 +74,7 @@ def _is_set(name: str) -> bool:
 
 
 class _Arguments:
-    """Arguments as machine code of numba's takes them.
+    """Arguments in the form that machine code of numba takes.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class _Arguments:
         if isinstance(value, np.ndarray):
             if not value.flags.carray:
                 raise TypeError("a kernel takes arrays that are contiguous and can be written")
-            # a tenth of the time of `ctypes.data`, which an array without elements needs
+            # This takes a tenth of the time of `ctypes.data`; only an array without elements needs `ctypes.data`.
             address = ctypes.addressof(_BYTE.from_buffer(cast(Any, value))) if value.size else value.ctypes.data
             self.types.append((value.dtype, value.ndim))
             # owner, parent, size, size of an item, address, shape, strides
@@ -118,7 +118,8 @@ _OBJECT_MAGICS = (b"\x7fELF", b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
 
 
 _ELF_SECTIONS = struct.Struct("<40xQ10xHHH")
-"""Of the header of an ELF file (64 bits): place of the table of sections, size of an entry, number of entries."""
+"""Layout of the header of an ELF file (64 bits): place of the table of sections, size of an entry, number of
+entries."""
 
 
 def _is_object(content: bytes) -> bool:
@@ -132,7 +133,7 @@ def _is_object(content: bytes) -> bool:
 
 
 def _is_own(place: Path) -> bool:
-    """Return whether nobody else may write a file or a folder: what is kept there is run."""
+    """Return whether no other user may write a file or folder: machine code that is kept there is executed."""
     if not hasattr(os, "geteuid"):
         return True
     status = place.stat()
@@ -140,20 +141,20 @@ def _is_own(place: Path) -> bool:
 
 
 class MachineCode(NamedTuple):
-    """A compiled kernel: the name of its function, what that returns (a key of `_RESULTS`), and the object file."""
+    """A compiled kernel: the name of its function, its type of result (a key of `_RESULTS`), the object file."""
 
     name: str
     result: str
     content: bytes
 
     def written(self) -> bytes:
-        """Return the bytes of its file: a digest of what follows, a line for each text, the object file."""
+        """Return the bytes of its file: a digest of the rest, a line for each text, the object file."""
         rest = b"\n".join([self.name.encode(), self.result.encode(), self.content])
         return hashlib.sha256(rest).digest() + rest
 
     @classmethod
     def read(cls, file: Path) -> MachineCode | None:
-        """Return what a file holds; None where it is not there, or damaged."""
+        """Return the kernel that a file holds; None where the file is missing or damaged."""
         with suppress(OSError, ValueError):
             data = file.read_bytes() if _is_own(file) and _is_own(file.parent) else b""
             if hashlib.sha256(data[32:]).digest() == data[:32]:
@@ -246,7 +247,7 @@ def _loaded(code: MachineCode | None, forms: Sequence[Any]) -> Callable[[Sequenc
 
 
 def machine_code(function: Callable[..., Any], values: Sequence[object], forms: Sequence[Any]) -> MachineCode | None:
-    """Return what numba makes of a function for arguments of some types.
+    """Return the machine code that numba makes of a function for arguments of some types.
 
     Parameters
     ----------
@@ -255,7 +256,7 @@ def machine_code(function: Callable[..., Any], values: Sequence[object], forms: 
     Returns
     -------
     MachineCode or None
-        None where numba of this version does or names something differently, and where the machine code needs numba.
+        None where this version of numba differs from the expected versions, and where the machine code needs numba.
     """
     try:
         return _machine_code(function, values, forms)
@@ -270,7 +271,7 @@ def _machine_code(function: Callable[..., Any], values: Sequence[object], forms:
     [signature] = dispatcher.nopython_signatures
     module, result = llvm.parse_assembly(dispatcher.inspect_llvm(signature.args)), signature.return_type
     called = {one.name for one in module.functions if one.is_declaration and not one.name.startswith("llvm.")}
-    # where a version of numba passes arguments otherwise, there is no such function
+    # A version of numba that passes arguments in another form has no such function.
     expected = [_LLVM_TYPES[form] for form in [_POINTER, _POINTER, *forms]]
     entries = [
         one.name
@@ -432,7 +433,7 @@ def processor() -> tuple[str, str]:
 def _stamp() -> tuple[str, ...]:
     """Return what machine code depends on: the sources of all kernels, compiler, target and processor.
 
-    All kernels, because the machine code of a kernel holds the kernels that it calls.
+    The sources of all kernels count, because the machine code of a kernel holds the kernels that it calls.
 
     Empty where nothing is to be kept: the kernels' sources cannot be read, or numba compiles for a debugger.
     """
@@ -441,7 +442,7 @@ def _stamp() -> tuple[str, ...]:
         return ()
     numba = find_spec("numba")
     if numba is not None and numba.origin is not None:
-        # its version, without importing it
+        # The version of numba, without importing numba.
         files += Path(numba.origin).parent.glob("_version.py")
     sources = hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
     return sources, llvmlite.__version__, llvm.get_default_triple(), *processor()
@@ -460,7 +461,7 @@ def cache_places() -> list[Path]:
 
 
 def writable_place() -> Path | None:
-    """Return the first place that can be written, made where it is not there; None where none can."""
+    """Return the first place that can be written, created if it is missing; None where no place can be written."""
     for place in cache_places():
         with suppress(OSError):
             place.mkdir(parents=True, exist_ok=True)

@@ -48,7 +48,8 @@ CHANGE, FIX, HEADING, WHEELS = range(4)
 """Kinds of events, in their order at equal stamps: terrain changes, fixes, headings, wheel samples."""
 
 BLOCK_EVENTS = 200_000
-"""Events in one compiled call of `run_ekf`: some 0.03 s, between which Ctrl-C and SIGTERM are acted on."""
+"""Number of events in one compiled call of `run_ekf`. A call takes some 0.03 s; Ctrl-C and SIGTERM act between
+calls."""
 
 
 @njit_part
@@ -344,7 +345,7 @@ def compiled_inputs(data: FilterInputs) -> FilterInputs:
 
 
 CHUNK_SAMPLES = 8192
-"""Wheel samples whose nodes are kept at once: some 30 MB."""
+"""Number of wheel samples whose nodes are kept at once. The nodes need some 30 MB."""
 
 
 class Smoothed(NamedTuple):
@@ -357,7 +358,7 @@ class Smoothed(NamedTuple):
 def run_smoother(
     data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, chunk_rows: int = CHUNK_SAMPLES
 ) -> Smoothed:
-    """Smooth the run that `run_ekf` makes of the same arguments.
+    """Return the smoothed states of the run that `run_ekf` makes of the same arguments.
 
     Returns
     -------

@@ -59,7 +59,7 @@ class Elimination(NamedTuple):
     gain: Floats
 
     def reduced(self, jacobian: Floats, parts: Parts) -> Floats:
-        """Return the derivatives (m, k) by the shared parameters where the parts' own follow."""
+        """Return the derivatives (m, k) by the shared parameters, which the parts' own follow."""
         shared, own = parts.split(jacobian)
         return shared - np.einsum("mc,mck->mk", own, parts.by_residual(self.gain)) if parts.own else shared
 

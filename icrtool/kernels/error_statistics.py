@@ -43,17 +43,19 @@ class Histogram(NamedTuple):
 SHARES = {"p50": 0.5, "p95": 0.95}
 
 FEWEST_PATH_BLOCKS = 3
-"""Least number of blocks of path for an interval: a path of less than twelve horizons has no interval."""
+"""Smallest number of blocks of path for an interval. A path of less than twelve horizons has no interval."""
 
 MOST_PATH_BLOCKS = 8
 """Largest number of blocks of path. More blocks make an interval narrower by at most a sixth (Student's factor is 2.36
 with eight blocks, 1.96 without limit), and the blocks are less independent."""
 
 HORIZONS_A_BLOCK = 4
-"""Least length of a block, in horizons: errors that change slowly over some horizons make shorter blocks alike."""
+"""Smallest length of a block, in horizons. Errors change slowly over some horizons, so that shorter blocks would not be
+independent."""
 
 PRIOR_FREEDOM = 6.0
-"""Degrees of freedom of the spread that is known of other drives: it has the weight of seven blocks of path."""
+"""Degrees of freedom of the spread that is known from other drives. This spread has the weight of seven blocks of
+path."""
 
 LEVEL, NORMAL_FACTOR = 0.95, 1.959964
 """Probability that the interval of a number of this drive contains the true value, and the normal quantile of that
@@ -69,7 +71,8 @@ class Spread(NamedTuple):
 
     Attributes
     ----------
-    shift : mean of the next drive's logarithm over this one's: numbers that were fitted to a drive fit it best
+    shift : mean difference of the logarithms, next drive minus this drive. Numbers that were fitted to a drive have
+        smaller errors in it
     between : standard deviation between long drives
     horizon_std : standard deviation of a drive as long as one horizon; the variance falls with the length of the drive
     grounds : standard deviation between kinds of ground, of numbers that were fitted to other grounds
@@ -118,7 +121,7 @@ class BlockSums(NamedTuple):
     ----------
     trials : (k,) trials that start in a block
     errors_m : (k,) [m] sum of their errors
-    above_p50, above_p95 : (k,) trials whose error is above the percentile of all
+    above_p50, above_p95 : (k,) number of trials with an error above p50, or p95, of all trials
     p50_slope_m, p95_slope_m : [m] growth of the percentile with the share of trials
     """
 
@@ -183,7 +186,7 @@ def student_factor(freedom: float, z: float = NORMAL_FACTOR) -> float:
 
 
 def pooled_variance(measured: float, freedom: float, known: float) -> tuple[float, float]:
-    """Return the pooled variance of a measured one and of one known of other drives, and its degrees of freedom.
+    """Return the mean of a measured variance and of a variance known from other drives, and its degrees of freedom.
 
     Notes
     -----
@@ -195,7 +198,7 @@ def pooled_variance(measured: float, freedom: float, known: float) -> tuple[floa
 
 
 def between_variance(values: Floats, variances: Floats) -> float:
-    """Return the variance between values (k,) beyond their own variances (k,); zero where these explain it.
+    """Return the variance between values (k,) beyond their own variances (k,); zero where their own explain all.
 
     Notes
     -----
@@ -245,12 +248,12 @@ def error_intervals(
 
     Notes
     -----
-    Normal logarithms, Student's t (1908). The variance of a drive is the variance that its blocks show, pooled with the
-    variance of drives of its length (`pooled_variance`), because few blocks alone would give intervals of any width.
-    p95 changes as the root mean square does, which blocks show better than the few trials above p95. On short paths
-    p95 is smaller than on long ones, its logarithm by about the variance of the logarithm. The upper end is raised by
-    this variance.
-    The interval of this drive's p95 does not go below its median, nor above the interval of the next drive.
+    The logarithms of the errors are normal, and the intervals follow from Student's t (1908). The variance of a drive
+    is the variance that its blocks show, pooled with the variance of drives of its length (`pooled_variance`), because
+    few blocks alone would give intervals of any width. p95 changes in proportion to the root mean square. Blocks show
+    the root mean square better than the few trials above p95 show p95. On short paths p95 is smaller than on long ones,
+    its logarithm by about the variance of the logarithm. The upper end is raised by this variance. The interval of this
+    drive's p95 does not go below its median, nor above the interval of the next drive.
 
     The next drive, of the same length, adds the variance of its own finite path and the variance between drives.
     """
@@ -291,8 +294,8 @@ def difference_half_width(
 
     Notes
     -----
-    Student's distribution. Paired: of the differences of the blocks' influences. Otherwise both variances
-    add up, degrees of freedom of Welch (1947).
+    The interval follows from Student's distribution. If `paired`, its variance comes from the differences of the
+    blocks' influences. Otherwise both variances add up, with the degrees of freedom of Welch (1947).
     """
     if now is None or before is None or metric not in {"expected", *SHARES}:
         return math.nan
@@ -310,7 +313,7 @@ def difference_half_width(
 def block_sums(
     errors_m: Floats, blocks: Blocks | None, ranked: RankedTrials, p50_m: float, p95_m: float
 ) -> BlockSums | None:
-    """Sum the trials of one horizon over blocks of path.
+    """Return the sums of the trials of one horizon over blocks of path.
 
     Parameters
     ----------
@@ -332,7 +335,7 @@ def block_sums(
     above = [np.array([np.count_nonzero(one > limit) for one in blocks_m]) for limit in (p50_m, p95_m)]
     growth = []
     for share, count in zip(SHARES.values(), above, strict=True):
-        # how a percentile grows with its share, over the uncertainty of the share (Woodruff 1952)
+        # Growth of a percentile with its share, over the range of the share's uncertainty (Woodruff 1952).
         std = math.sqrt(variance_of_sum(np.asarray((count - (1.0 - share) * trials) / len(errors))))
         low, high = max(share - std, 0.0), min(share + std, 1.0)
         growth.append((ranked.quantile(high) - ranked.quantile(low)) / (high - low) if high > low else 0.0)
@@ -340,7 +343,7 @@ def block_sums(
 
 
 PERCENTILE_CELLS = 1024
-"""Cells into which errors are sorted to find a percentile: one cell then holds few errors."""
+"""Number of cells into which errors are sorted to find a percentile. A cell then holds few errors."""
 
 
 def count_cells(errors_m: Floats, width_m: float) -> tuple[NDArray[np.int16], Ints]:
@@ -376,7 +379,7 @@ class RankedTrials(NamedTuple):
         return cls(trials, cell, np.append(0, np.cumsum(counts)))
 
     def quantile(self, share: float) -> float:
-        """Return numpy's 'linear' quantile of the errors, of which there are some."""
+        """Return numpy's 'linear' quantile of the errors; at least one error is needed."""
         last = len(self.errors_m) - 1
         rank = share * last
         ranks = np.array([math.floor(rank), min(math.floor(rank) + 1, last)])
@@ -402,13 +405,13 @@ class RankedTrials(NamedTuple):
 
 
 BLOCK_PARTS = 4
-"""Parts of a horizon: blocks begin at every quarter of a horizon."""
+"""Number of parts of a horizon. Blocks begin at every quarter of a horizon."""
 HISTOGRAM_BINS = 50
 """Number of bins from zero to the largest error; a histogram has this number or fewer."""
 
 
 def error_summary(errors_m: Floats) -> Summary:
-    """Summarise the trials of every horizon; `errors_m` is (n_starts, n_horizons).
+    """Return the summary of the trials of every horizon; `errors_m` is (n_starts, n_horizons).
 
     Notes
     -----
@@ -421,7 +424,7 @@ def error_summary(errors_m: Floats) -> Summary:
 
 
 def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
-    """Cut the path of one horizon's trials into blocks of equal length, at least `HORIZONS_A_BLOCK` horizons.
+    """Return the path of one horizon's trials in blocks of equal length, at least `HORIZONS_A_BLOCK` horizons.
 
     Parameters
     ----------
@@ -489,7 +492,7 @@ def never_falling(values: Floats) -> Floats:
     first, last = np.arange(n)[:, None], np.arange(n)
     length = last - first + 1
     means = np.where(length > 0, (sums[1:] - sums[:-1, None]) / np.maximum(length, 1), np.inf)
-    # the smallest mean of a stretch from each first value to each last one or further
+    # For each first and last value: the smallest mean of a stretch from the first value to the last or beyond.
     least = np.minimum.accumulate(means[:, ::-1], axis=1)[:, ::-1]
     least[length <= 0] = -np.inf
     highest: Floats = least.max(axis=0)

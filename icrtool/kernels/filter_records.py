@@ -22,7 +22,8 @@ GUARDED, UNGUARDED, PRINTED = 0, 1, 2
 """
 
 REFERENCE_STEP_S = 0.01
-"""The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
+"""Step of the paper's filter, which propagates at 100 Hz [s]. Its process noise dt^2 Q per step is 0.01 s * Q per
+second."""
 
 
 class FilterParameters(NamedTuple):
@@ -92,7 +93,7 @@ class FilterInputs(NamedTuple):
 
 
 class FilterOutput(NamedTuple):
-    """What a run makes, for each recorded state, fix and heading; filled in place as it goes on.
+    """Results of a run for each recorded state, fix and heading; the run fills them in place.
 
     Attributes
     ----------
@@ -102,7 +103,7 @@ class FilterOutput(NamedTuple):
     gnss_residual : (m, 2) fix minus estimate after the update, north and east [m]
     heading_code, heading_nis, heading_innovation : (h,) likewise; the last is before the update [rad]
     P : (6, 6) covariance at the end
-    P_at_stops : (s, 6, 6) likewise at the rows that were asked for
+    P_at_stops : (s, 6, 6) covariance at the requested rows
     """
 
     states: Floats
@@ -152,7 +153,7 @@ class Events(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """All that a run needs to go on from the events before. Changed in place.
+    """The state from which a run continues after the events before. It is changed in place.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the Kalman filters and smoothers share, for any number of states, and the filter of a heading made of it.
+"""Steps of Kalman filters and smoothers for any number of states, and the filter of a heading that uses them.
 
 One propagate, one correct, one step back. The covariance P is (k, k), symmetric, and changed in place, as is the state
 x (k,). Kalman 1960; Rauch, Tung, Striebel 1965. Sizes are arguments: a plain number in a call is a constant to the
@@ -7,8 +7,8 @@ compiler, which then unrolls the loops.
 The filter of a heading goes event by event. Its state is x = (heading, bias, scale error, further ones): the heading,
 constants and slowly varying errors. Between events the heading grows by (1 + scale) turn - bias dt, with turn the
 integrated rate; further states stay, or decay to zero. Every event measures one number: z = h x + noise, wrapped where
-it is an angle. An innovation beyond `HUBER_SIGMAS` counts as one of that size (bounded influence: Masreliez and Martin
-1977). States that are uncertain, but not estimated: Schmidt 1966.
+it is an angle. An innovation beyond `HUBER_SIGMAS` counts as an innovation of `HUBER_SIGMAS` (bounded influence:
+Masreliez and Martin 1977). Some states are uncertain but not estimated (Schmidt 1966).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from icrtool.kernels.compiled import njit, njit_part
 
 @njit_part
 def propagate(G: Floats, P: Floats, T: Floats, m: int, first: int, c: int, k: int) -> None:
-    """Replace P by F P F^T (Eq. 16): F is the identity, and G (m, c) more in its first rows, from column `first` on.
+    """Replace P by F P F^T (Eq. 16): F is the identity plus G (m, c) in its first rows, from column `first` on.
 
-    T (m, k) is space.
+    T (m, k) is memory for intermediate results.
     """
     for i in range(m):
         for j in range(k):
@@ -87,7 +87,7 @@ def smooth_passes(F: Floats, x_predicted: Floats, P_predicted: Floats, x: Floats
         hi = min(lo + ROWS_AT_ONCE, len(F))
         following, both = slice(lo + 1, hi + 1), slice(lo, hi + 1)
         certain = np.diagonal(P_predicted[following], axis1=1, axis2=2) == 0.0
-        # a state that is known for certain (no process noise) has nothing to smooth: any variance solves for that
+        # A state with variance 0 stays as it is: a variance of 1 in its place only keeps the matrix invertible.
         solved = np.linalg.solve(P_predicted[following] + certain[:, :, None] * np.eye(x.shape[1]), F[lo:hi] @ P[lo:hi])
         step_back(solved, x_predicted[both], P_predicted[both], x[both], P[both], np.empty(P.shape[1:]))
 
@@ -113,13 +113,13 @@ HUBER_SIGMAS = 2.5
 
 
 class HeadingEvents(NamedTuple):
-    """What is measured, in order of time; (n, ...) each.
+    """Events of the heading filter, in order of time; (n, ...) each.
 
     Attributes
     ----------
     dt : seconds since the event before; turn : integrated turn rate over them [rad]
     extra : further variance of that turn [rad^2]
-    z : measured; h : (n, k) its derivative by the state; r : variance; angle : whether z is one
+    z : measured value; h : (n, k) its derivative by the state; r : its variance; angle : whether z is an angle
     """
 
     dt: Floats
@@ -136,13 +136,13 @@ class HeadingEvents(NamedTuple):
 
 
 class HeadingModel(NamedTuple):
-    """Start and process of the states.
+    """Initial state and process noise of the heading filter.
 
     Attributes
     ----------
     x : (k,), P : (k, k) at the first event
     q : (k,) process variance per second; decay : (k,) [1/s], 0 for a state that stays
-    fixed : (k,) states whose values are kept: their uncertainty counts, they are not estimated
+    fixed : (k,) states that keep their values: their uncertainty counts, but they are not estimated
     """
 
     x: Floats
@@ -164,7 +164,7 @@ class HeadingPasses(NamedTuple):
 
 
 def filter_headings(events: HeadingEvents, model: HeadingModel) -> HeadingPasses:
-    """Run the filter."""
+    """Return the forward pass of the filter over events."""
     n, k = events.h.shape
     out = HeadingPasses(
         np.empty((n, k)), np.empty((n, k, k)), np.empty((n, k)), np.empty((n, k, k)), np.empty(n), np.empty(n)

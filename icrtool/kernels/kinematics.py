@@ -25,7 +25,7 @@ MIN_ICR_SEPARATION_M = 1e-6
 def body_velocity(
     v_left: Number, v_right: Number, y_icr_right: Number, y_icr_left: Number, x_icr: Number
 ) -> tuple[Number, Number, Number]:
-    """Map track speeds to body velocity.
+    """Return the body velocity that track speeds give.
 
     Parameters
     ----------

@@ -83,7 +83,7 @@ def follow_path(
     t: Floats, held: Floats, into: float, fixed: Floats, axes: Floats, columns: Floats, values: Floats, knot_t: Floats,
     sums: Floats, by: Floats, knots: Floats,
 ) -> None:  # fmt: skip
-    """Fill the knots (m, 3 (p + 2)) of the path that the wheel samples make; sums, by (3 (p + 2),) are space, sums 0.
+    """Fill the knots (m, 3 (p + 2)) of the path by the wheel samples; sums (0), by: (3 (p + 2),) of memory.
 
     A knot has the derivatives of the heading by each term, its rate, and its value; then those of the place ahead, and
     of the place to the right.
@@ -206,7 +206,8 @@ def take_windows(  # noqa: C901, PLR0912 - fewer functions are compiled in less 
     belief : (2 q + 3, q): information and matrix (q, q) each, pull, vector, x, of `Belief`
     scale, overlap, largest_delay_s : as in `Belief`
     k : number of the model's terms
-    change : (q,), 0; residuals, jacobian : (3 w,), (3 w, q); added, whole : (q + 1, q); all are space
+    change : (q,), 0; residuals, jacobian : (3 w,), (3 w, q); added, whole : (q + 1, q); all are memory for intermediate
+        results
     """
     follow_path(t, held, into, fixed, axes, columns, values, knot_t, sums, by, knots)
     compare_windows(knots, windows, seen, offset, k, residuals, jacobian)
@@ -255,7 +256,7 @@ def take_windows(  # noqa: C901, PLR0912 - fewer functions are compiled in less 
 
 
 def learn(of: LearnedWindows, belief: Belief, k: int, steps: int) -> Belief:
-    """Return what is known after some windows: `steps` Gauss-Newton steps from `belief.x`, and the windows added.
+    """Return the belief after some windows: `steps` Gauss-Newton steps from `belief.x`, and the windows added.
 
     Parameters
     ----------

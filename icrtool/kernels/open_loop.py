@@ -107,7 +107,7 @@ def open_loop_errors_direct(track: Track, icrs: FrozenIcrs, ends: Rows, lo: int 
     Parameters
     ----------
     track : of recorded states (n,)
-    icrs : what each start drives with
+    icrs : the ICRs with which each start drives
     ends : (n_starts, n_horizons) of `trial_ends`, for the starts from `lo` on
 
     Returns
@@ -171,28 +171,30 @@ def open_loop_pieces(track: Track, icrs: FrozenIcrs, start: int, end: int) -> It
 TOLERANCE_M = 1e-11
 """Largest error [m] of an end position by the moments left out. With rounding the total stays well below 1e-9 m."""
 ROUNDING_LIMIT_M = 2e-10
-"""Where rounding alone could move an end position by this much [m], the path is integrated directly."""
+"""Possible rounding error of an end position [m] from which on the path is integrated directly."""
 MAX_MOMENTS = 16
-"""A block that needs more moments is split: halving the block is cheaper than doubling its moments."""
+"""Largest number of moments of a block. A block that needs more is split, because halving the block is cheaper than
+doubling its moments."""
 MIN_BLOCK = 8
-"""Blocks of this size are integrated directly instead of split: that is not slower."""
+"""Number of starts at which a block is integrated directly instead of being split, which would not be faster."""
 BLOCK = 4096
-"""Starts of a block. A block has at least one start for each state of its first trial: the window is then about twice
-the block."""
+"""Number of starts of a block. A block has at least one start for each state of its first trial, so that its window is
+about twice the block."""
 CONSTANT_BLOCK = 8192
-"""Starts of a block where every start has the same ICRs: one moment is enough for any block, and longer blocks share
-more."""
+"""Number of starts of a block where every start has the same ICRs. One moment is then enough, and a longer block shares
+more sums."""
 MAX_BLOCK = 32768
-"""Starts of the longest block, and states whose moments are kept at once: bounds the memory to a few MB."""
+"""Number of starts of the longest block, and of states whose moments are kept at once. It bounds the memory to a few
+MB."""
 _EPS = 2.220446049250313e-16
 
 
 class BlockPlan(NamedTuple):
-    """How a block of starts is served.
+    """How the errors of a block of starts are computed.
 
     Attributes
     ----------
-    moments : how many moments; 0: none keep the tolerance
+    moments : number of moments; 0: no number of moments keeps the tolerance
     a_centre, half_width : a_c and w [1/m]
     first_turn : D [m] of the block's first state, against the middle of its range
     """
@@ -234,8 +236,8 @@ def plan_block(columns: Columns, icrs: FrozenIcrs, last: int, starts: slice) -> 
 
     Notes
     -----
-    What is left out after M moments is below scale (w r)^M / M! / (1 - w r / (M + 1)), with r the half range of D and
-    scale the length of a path on which nothing cancels.
+    The error after M moments is below scale (w r)^M / M! / (1 - w r / (M + 1)), with r the half range of D and scale
+    the length of a path on which nothing cancels.
     """
     turn_min, turn_max, travel_left, travel_right = 0.0, 0.0, 0.0, 0.0
     for steps in wheel_steps(columns, starts.start, last, 0.0):

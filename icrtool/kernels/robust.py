@@ -17,10 +17,10 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.elimination import Parts, eliminate, normal_equations
 
 MAD_TO_STD = 1.4826
-"""Standard deviation over median absolute deviation, for normal values."""
+"""Ratio of the standard deviation to the median absolute deviation, for normal values."""
 
 LOSS_SIGMAS = 2.0
-"""Where the loss turns from square to linear, in robust standard deviations."""
+"""Size of a residual at which the loss changes from square to linear, in robust standard deviations."""
 
 SMALLEST_SCALE = 1e-5
 """Smallest robust standard deviation of residuals [m, rad]; no sensor is as exact. Residuals of an exact fit have no
@@ -28,12 +28,12 @@ spread: with a smaller value the information of exact data would exceed the info
 covariance of parameters that the data do not show would be rounding error."""
 
 LAST_STEP_SIGMAS = 0.03
-"""A Gauss-Newton step shorter than this in standard deviations, all parameters together, is the last one."""
+"""Length of a Gauss-Newton step, in standard deviations of all parameters together, below which it is the last step."""
 
 MOST_HALVINGS = 6
 
 FEWEST_CORRELATED_BLOCKS = 8
-"""Least number of values from which a correlation between neighbours is estimated."""
+"""Smallest number of values from which a correlation between neighbours is estimated."""
 
 LARGEST_CORRELATION = 0.9
 """Limit of an estimated correlation between neighbours."""
@@ -258,7 +258,7 @@ def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None =
     inverse = np.linalg.inv(fit.information)
     sandwich = inverse @ meat @ inverse
     if not (np.diag(sandwich) > 0.0).all():
-        # rounding: weights that differ by hundreds of decades
+        # Weights that differ by hundreds of decades give rounding errors.
         sandwich = inverse
     # exact data that do not separate the parameters leave no finite covariance
     with np.errstate(over="ignore", invalid="ignore"):
@@ -289,8 +289,8 @@ def correlated_covariance(fit: Linearised, group: Ints) -> Floats:
 
     Notes
     -----
-    `sandwich_covariance`, grown: the influence of the groups on each parameter is a series in order of distance, to
-    which `long_run_factor` applies.
+    The result is `sandwich_covariance` times `long_run_factor`. The series for this factor is the influence of the
+    groups on each parameter, in order of distance.
     """
     covariance = sandwich_covariance(fit, group)
     inverse = np.linalg.inv(fit.information)
@@ -338,8 +338,9 @@ def long_run_factor(series: Floats) -> Floats:
 
     Notes
     -----
-    (1 + rho) / (1 - rho) of a first-order correlation rho (Andrews and Monahan 1992), with Kendall's (1954) correction
-    for few values; of single values and of sums of 2, 4, ... of them, the largest.
+    The factor is (1 + rho) / (1 - rho) with a first-order correlation rho (Andrews and Monahan 1992) and Kendall's
+    (1954) correction for few values. It is computed for single values and for sums of 2, 4, ... values, and the largest
+    factor is returned.
     """
     total = np.maximum((series**2).sum(axis=0), 1e-300)
     factor = np.ones(series.shape[1])

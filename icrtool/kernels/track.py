@@ -26,7 +26,8 @@ this standstill. `JUMP`: the reference jumps in between."""
 class Track(NamedTuple):
     """Wheels and reference of one drive, each on its own clock, seconds since any one epoch.
 
-    Of recorded states (`Track.of_states`) all clocks are the same, and every column has a row for each state.
+    In a track of recorded states (`Track.of_states`) all clocks are the same, and every column has a row for each
+    state.
 
     Attributes
     ----------
@@ -199,7 +200,7 @@ class Windows:
     length_m: Floats
 
     def over(self, at_places: Rate) -> Rate:
-        """Return the change in each window (w,) of what is known at the positions (m,)."""
+        """Return the change over each window (w,) of a quantity that is given at the positions (m,)."""
         return at_places[self.end] - at_places[self.begin]
 
     @cached_property
@@ -243,7 +244,7 @@ def fill_ends(
     distance: Floats, place_t: Floats, in_outage: Bools, gap_t: Floats, jumps: Ints, horizons_m: Floats, starts: Ints,
     ends: Rows,
 ) -> None:  # fmt: skip
-    """Fill `ends` (h, k) of `ends_from`; begins of gaps and rows of jumps are followed by one beyond all others."""
+    """Fill `ends` (h, k) of `ends_from`; the last begin of a gap and the last row of a jump are beyond all."""
     rows = len(distance)
     for h in range(len(horizons_m)):
         end, gap, jump = 0, 0, 0
@@ -315,7 +316,7 @@ class OpenLoopPath(NamedTuple):
 
 
 class TrialCounts(NamedTuple):
-    """How many starts were a trial, and why the others were none; int64 (n_horizons,) each."""
+    """Number of starts with a trial, and of starts without a trial by reason; int64 (n_horizons,) each."""
 
     trials: Ints
     short: Ints
@@ -331,6 +332,6 @@ def trial_ends(track: Track, horizons_m: Floats, lo: int = 0, hi: int | None = N
 
 
 def count_trials(ends: Rows) -> TrialCounts:
-    """Count trials and the kinds of no trial per horizon in `ends` (n_starts, n_horizons)."""
+    """Return the number of trials, and of starts without a trial by reason, from `ends` (n_starts, n_horizons)."""
     kinds = np.array([np.bincount(-column[column < 0], minlength=1 - JUMP) for column in ends.T]).T
     return TrialCounts(len(ends) - kinds.sum(axis=0), *kinds[-np.array([SHORT, GAP, OUTAGE, STANDING, JUMP])])

@@ -1,4 +1,4 @@
-"""Paths of a motion model that is linear in its parameters, and residuals of windows of them, with derivatives.
+"""Paths of a motion model that is linear in its parameters, and residuals of windows of a path, with derivatives.
 
 With z = forward + j right, heading Theta and place S are sums over steps, and a window from knot s to knot e displaces
 the robot, in the body frame of its start, by d = e^{-j Theta_s} (S_e - S_s). omega is linear in the parameters, so

@@ -50,7 +50,7 @@ WINDOWS_AS_ONE = 80.0
 one and two times."""
 
 GAUSS_NEWTON_STEPS = 3
-"""Steps from one solution to the next."""
+"""Number of Gauss-Newton steps from one solution to the next."""
 
 SHARE_OF_DISTANCE = 0.02
 """Distance between two solutions, as a share of the driven distance."""
@@ -104,7 +104,7 @@ class TermsPrior:
     width_m : track width b that the terms refer to [m]
     mean, covariance : (8,), (8, 8)
     turned_mean, turned_covariance : of the terms of the model with a gyro (6,), (6, 6)
-    source : what it was made from, in a few words
+    source : origin of the prior, in a few words
     constants, turned_constants : what is known of the drive's constants, with wheels alone and with a gyro
     """
 
@@ -320,7 +320,7 @@ class AdaptiveModel:
 
         Notes
         -----
-        As `observe` of each, their times counted from the first one.
+        The result is the same as with `observe` for each sample. Times count from the first sample.
         """
         if self._begin_s is None:
             self._begin_s = 0.0

@@ -5,8 +5,7 @@ forward, y right, omega clockwise. Track width b, v = (V_l + V_r) / 2, w = (V_l 
 configured wheel radius.
 
 The track ICRs (Pentzer 2014, Eqs. 8-12) are a member: with W = y_r - y_l the twist is
-v_x = v + (y_r + y_l) / W w b / 2, v_y = -2 x / W w b / 2, omega = b / W w. The no-slip model is the one
-without free terms.
+v_x = v + (y_r + y_l) / W w b / 2, v_y = -2 x / W w b / 2, omega = b / W w. The no-slip model has no free terms.
 """
 
 from __future__ import annotations
@@ -154,7 +153,7 @@ class MotionModel:
         return GYRO_TERMS[0] in self.terms
 
     def with_gyro(self) -> MotionModel:
-        """Return the same model, its turn rate the weighted mean of its own and a gyro's."""
+        """Return the same model, with a turn rate that is the weighted mean of its own turn rate and a gyro's."""
         moves = tuple(name for name in self.terms if TERMS[name].axis != OMEGA)
         return MotionModel(f"{self.name}_gyro", f"{self.label} + gyro", (*moves, *GYRO_TERMS), self.source)
 
@@ -345,7 +344,7 @@ class FittedModel:
 
 
 class Lever(NamedTuple):
-    """Whether the measured point of the position is known, ahead and to the right of the body's origin.
+    """Whether it is known how far ahead, and how far to the right, of the body's origin the position is measured.
 
     An unknown part has the same effect as ICRs off centre. It is a constant of the log, not an error of a controller.
     """
@@ -388,7 +387,7 @@ def find_model(name: str) -> MotionModel:
     Raises
     ------
     KeyError
-        There is none.
+        No model has this name.
     """
     base = name.removesuffix("_gyro")
     return MODELS[base].with_gyro() if base != name else MODELS[base]

@@ -97,8 +97,8 @@ class Recording:
     lever : which parts of the measured point's place on the robot are known
     x_clock_std_m : standard deviation of x_icr [m] from the unknown time between position and heading
     wheel_scales : ratios of the left and right speeds of `track` to the speeds that models are fitted to
-    corrected : constants that were corrected in `track` before; with the constants that are found in it, what the
-        sensors of the log had
+    corrected : constants that were corrected in `track` before. Their sum with the constants that are found in `track`
+        gives the constants of the log's sensors
     heading_source : kind of the heading, as `HeadingFacts.source`; empty where it is not known
     """
 
@@ -375,7 +375,7 @@ class GyroLine(NamedTuple):
 
 
 def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: Floats) -> GyroLine:
-    """Fit the line to the reference's turns over seconds.
+    """Return the line that maps the turns of a gyro to the turns of the reference over `TURN_S`.
 
     Parameters
     ----------
@@ -420,7 +420,7 @@ MEAN_TO_STD = 1.2533
 """Ratio of the standard deviation of normal values to their mean size."""
 
 MOST_SIGMAS = 3.0
-"""A larger difference counts as this many standard deviations in the spread of the differences."""
+"""Size of a difference of turns, in standard deviations, to which larger differences are limited in the spread."""
 
 RENEWED_S = 10.0
 """Time between two lines of a gyro [s]. Scale and bias change slowly; in the first seconds of a drive the lines follow
@@ -447,7 +447,7 @@ def past_gyro_lines(track: Track) -> PastLines:
 
 
 def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tuple[float, float]) -> PastLines:
-    """Return the lines from turns to the turns of a track's reference as known from the past of each state.
+    """Return the lines from measured turns to the reference's turns, as known from the past of each state.
 
     Parameters
     ----------
@@ -466,7 +466,7 @@ def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tu
         begins.append(begins[-1] + min(max(begins[-1], TURN_S), RENEWED_S))
     rows = np.searchsorted(t, begins[: max(len(begins) - 1, 1)])
     made = [np.diff(column).tolist() for column in (turned_at(every), lasted[every], track.heading[every])]
-    # of scale - 1 and bias: information and its vector
+    # Information matrix of scale - 1 and bias, and information times mean.
     a, b, c = max(before_std[0], SMALLEST_SCALE_STD) ** -2.0, 0.0, before_std[1] ** -2.0
     p = q = scale = bias = 0.0
     count, sizes, done = GUESSED_TURNS, GUESSED_TURNS * TURN_NOISE_RAD / MEAN_TO_STD, 0

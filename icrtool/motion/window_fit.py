@@ -75,7 +75,8 @@ def heading_wander(turned: Floats, length_m: Floats) -> float:
 
     Notes
     -----
-    The increase of the variance from short to long windows. The part common to both is the reference's noise.
+    The growth is the increase of the variance from short to long windows. The part that both have is the reference's
+    noise.
     """
     short, long = float(length_m.min()), float(length_m.max())
     if short == long:
@@ -94,8 +95,8 @@ def shortening_by_wander(wander: float, length_m: Floats) -> Floats:
     Notes
     -----
     A heading that wanders with a variance of q for each metre leaves the mean of e^{j Theta} short by q s / 2 after s
-    metres: a displacement over L by q L / 4, to first order. Without it, the scale of the wheels, and with it the
-    multiplier, is too small.
+    metres: a displacement over L by q L / 4, to first order. Without this ratio, the scale of the wheels and the
+    multiplier would be too small.
     """
     return np.asarray(np.exp(-wander * length_m / 4.0))
 
@@ -148,7 +149,7 @@ def residuals_of(
 
 
 class StepColumns(NamedTuple):
-    """What moves a path at each of n steps: p free terms, of them k of the model and those of the gyro's constants.
+    """Twists of a path at each of n steps, with p free terms: k of the model, and the terms of the gyro's constants.
 
     Attributes
     ----------
@@ -380,7 +381,7 @@ class KnownConstants(NamedTuple):
     std: LogConstants
 
     def usual(self) -> KnownConstants:
-        """Return them with the prior of a drive, `CONSTANT_STD` about zero, in place of what is not known."""
+        """Return the constants; unknown constants get the prior of a drive, `CONSTANT_STD` about zero."""
         both = zip(self.mean, self.std, UNKNOWN_CONSTANTS.std, strict=True)
         pairs = [(mean, std) if np.isfinite(mean) else (0.0, usual) for mean, std, usual in both]
         mean, std = zip(*pairs, strict=True)
@@ -388,7 +389,7 @@ class KnownConstants(NamedTuple):
 
 
 UNKNOWN_CONSTANTS = KnownConstants(LogConstants(), LogConstants(*CONSTANT_STD.tolist()))
-"""What is known of a drive's constants where nothing but the usual spread is known."""
+"""Constants of a drive of which only the usual spread is known."""
 
 
 def own_constants(
@@ -458,7 +459,7 @@ class Pool:
     first : (recordings + 1,) first residual of each, and the number of all
     kind : (m,) of `RESIDUAL_KINDS`
     group : (m,) stretches of distance whose residuals depend on one another
-    overlap : how many windows cover a place on average
+    overlap : mean number of windows that cover a place
     """
 
     def __init__(self, windows: Sequence[Windows], widths_m: Sequence[float]) -> None:

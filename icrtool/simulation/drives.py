@@ -44,7 +44,8 @@ DATUM = (40.7934, -77.86, 350.0)
 """Latitude, longitude [deg] and height [m] of the first pose."""
 
 LARGEST_RTK_STD_M, LARGEST_SBAS_STD_M = 0.05, 0.6
-"""Largest standard deviations of fixes with status GBAS and SBAS in NavSatStatus [m]; above both it is a plain fix."""
+"""Largest standard deviations of fixes with status GBAS and SBAS in NavSatStatus [m]; a fix with a larger standard
+deviation is a plain fix."""
 
 TruthTable = dict[str, Floats | Ints]
 """Truth at every wheel stamp: the columns of the truth CSV, (n,) each."""
@@ -93,7 +94,7 @@ class DrivePlan:
     path : a path, or given track speeds
     command_rate_hz : rate of the motor commands, each held until the next; None: a command at every step
     motor_lag_s : time constant with which the tracks follow their commands; 0: without lag
-    step_s : track speeds of a path are held this long; one over a whole number
+    step_s : time for which track speeds of a path are held [s]: 1 over a whole number
     """
 
     icrs_m: Icrs = PAPER_ICRS_M
@@ -172,7 +173,7 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
     Raises
     ------
     ConfigError
-        It names the impossible value.
+        A value is impossible; the error names this value.
     """
     # Refuse numbers whose samples fill the memory, and numbers that no robot, sensor or drive has.
     for part in (plan, sensors, plan.path, *([] if plan.robot is None else [plan.robot])):

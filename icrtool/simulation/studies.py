@@ -1,4 +1,4 @@
-"""Studies: the paper's simulations (Pentzer 2014, Section 5) over many seeds, on the paper's robot or on one's own.
+"""Studies: the paper's simulations (Pentzer 2014, Section 5) over many seeds, on the paper's robot or another.
 
 A study is a row of `STUDIES`. It states what varies, what is measured in each run, which numbers are reported, and
 which number is the answer. `run_study` runs a study; `icrtool.output.figures.study` draws it.
@@ -38,7 +38,7 @@ PAPER_TRACK_WIDTH_M = 0.51
 """Track width of the simulated robot in Pentzer 2014, Section 5 [m]."""
 
 MOST_RUNS = 100_000
-"""Largest number of runs of a setting."""
+"""Largest number of runs of each setting."""
 
 SHOWN_S = 20.0
 """Time from the start of a run that the picture of convergence shows [s]."""

@@ -221,7 +221,7 @@ class StudyNumber(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """A study.
+    """The definition of a study: what varies, what is measured, and which numbers are reported.
 
     Attributes
     ----------

@@ -50,13 +50,13 @@ ZOOM_S = 10.0
 
 TRIAL_M = 10.0
 TRIAL_STARTS = 40
-"""Open-loop trials per run; their starts are evenly spaced."""
+"""Number of open-loop trials of a run. Their starts are evenly spaced."""
 
 COVARIANCE_FROM_S = 10.0
 """Time after which covariances count [s]. Before it, the presets' initial values have an effect."""
 
 LEAST_STD = 1e-12
-"""Smallest standard deviation to divide by. It avoids a division by zero."""
+"""Smallest standard deviation to divide by, which avoids a division by zero."""
 
 
 @dataclass(frozen=True, slots=True)
