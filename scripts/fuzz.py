@@ -13,6 +13,7 @@ import gc
 import gzip
 import io
 import lzma
+import re
 import resource
 import shutil
 import signal
@@ -192,8 +193,13 @@ def database(path: Path, rng: Random) -> str:
     return f"SQL {statement.split()[0]}"
 
 
-KINDS = (("mcap", "none"), ("mcap", "none"), ("mcap", "zstd"), ("bag", "none"), ("bag", "lz4"), ("db3", "none"),
-         ("db3", "zstd"), ("csv", "none"))  # fmt: skip
+KINDS = (("mcap", "none"), ("mcap", "zstd"), ("bag", "none"), ("bag", "lz4"), ("db3", "none"), ("db3", "zstd"),
+         ("csv", "none"), ("mcap", "lz4"), ("mcap", "without index"), ("mcap", "without chunks"), ("bag", "bz2"),
+         ("db3", "zstd-file"), ("csv", "semicolons"), ("csv", "tabs"), ("mcap", "directory"))  # fmt: skip
+"""Containers of logs, each with its compression or form: every one that `icrtool.logs` reads."""
+
+MANY_KINDS = 7
+"""The first kinds are made twice as often."""
 
 SCHEMA_LOGS = 0.1
 """Share of logs that are made of schemas, of long names and many fields, in each serialization that is read."""
@@ -207,26 +213,55 @@ MUTATED_COLUMNS = 0.12
 
 def name_of(kind: int) -> str:
     """Return the name of a log of a kind."""
-    return "log" + {"mcap": ".mcap", "bag": ".bag", "db3": "", "csv": ".csv"}[KINDS[kind][0]]
+    container, form = KINDS[kind]
+    return (
+        "log" if form == "directory" else "log" + {"mcap": ".mcap", "bag": ".bag", "db3": "", "csv": ".csv"}[container]
+    )
 
 
 def write(folder: Path, columns: dict[str, np.ndarray], kind: int, wheels: str) -> Path:
     """Write a log."""
     from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
+    from tests.property.test_fuzz_logs import MCAP, rewrite
 
-    container, compression = KINDS[kind]
+    container, form = KINDS[kind]
     if container == "csv":
-        return write_table(folder / name_of(kind), columns)
+        return write_table(folder / name_of(kind), columns, form)
+    compression = "none" if form in ("without index", "without chunks", "directory") else form
     options = WriteOptions(
         container=container, compression=compression, wheels=wheels, wheel_radius_m=0.165, track_width_m=0.55
     )
     # columns of any values: what overflows here is what the log is to hold
     with np.errstate(all="ignore"):
-        return write_log(folder / name_of(kind), SensorColumns(**columns), options)
+        if compression == form:
+            return write_log(folder / name_of(kind), SensorColumns(**columns), options)
+        whole = write_log(folder / "whole.mcap", SensorColumns(**columns), options)
+    target = folder / name_of(kind)
+    if form == "directory":
+        target.mkdir()
+        (target / "metadata.yaml").write_text(METADATA)
+        return whole.replace(target / "log_0.mcap").parent
+    rewrite(whole, target, **MCAP[f"mcap {form}"])
+    whole.unlink()
+    return target
 
 
-def write_table(path: Path, columns: dict[str, np.ndarray]) -> Path:
-    """Write a table of a row for each wheel sample, with the fixes and headings of the same numbers."""
+METADATA = """rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: mcap
+  relative_file_paths: [log_0.mcap]
+  compression_format: ''
+  compression_mode: ''
+"""
+
+
+def write_table(path: Path, columns: dict[str, np.ndarray], form: str) -> Path:
+    """Write a table of a row for each wheel sample, with the fixes and headings of the same numbers.
+
+    Parameters
+    ----------
+    form : what stands between the columns; with semicolons, decimal commas and the mark of UTF-8
+    """
     names = {"wheel_stamp_ns": "stamp_ns", "wheel_v_left_mps": "v_left_mps", "wheel_v_right_mps": "v_right_mps",
              "latitude_deg": "latitude_deg", "longitude_deg": "longitude_deg", "heading_rad": "yaw_rad",
              "yaw_rate_radps": "yaw_rate_radps"}  # fmt: skip
@@ -234,7 +269,12 @@ def write_table(path: Path, columns: dict[str, np.ndarray]) -> Path:
     for i in range(len(columns["wheel_stamp_ns"])):
         values = (columns[name][i : i + 1].tolist() for name in names)
         rows.append(",".join(str(value[0]) if value else "" for value in values))
-    path.write_text("\n".join(rows))
+    text = "\n".join(rows)
+    if form == "semicolons":
+        text = "\ufeff" + text.replace(",", ";").replace(".", ",").replace("\n", "\r\n")
+    elif form == "tabs":
+        text = text.replace(",", "\t")
+    path.write_bytes(text.encode())
     return path
 
 
@@ -290,9 +330,15 @@ def make_log(folder: Path, rng: Random) -> tuple[Path, list[str]]:
     path, done = make_plain(folder, rng)
     if rng.random() >= PACKED_LOGS:
         return path, done
-    kind = str(rng.choice(["gz", "bz2", "xz", "zst", "lz4", "tar", "tgz", "zip"]))
+    kind = str(rng.choice(PACKERS))
+    if rng.random() < 0.3:
+        # what stands in an archive may be compressed, or be an archive
+        inner = str(rng.choice(PACKERS))
+        first = path.parent / f"{path.name}.{inner}"
+        first.write_bytes(packed(path, inner, rng))
+        path, done = first, [inner, *done]
     target = path.parent / f"{path.name}.{kind}"
-    target.write_bytes(packed(path, kind))
+    target.write_bytes(packed(path, kind, rng))
     if rng.random() < 0.7:
         content = bytearray(target.read_bytes())
         done = [*done, *(str(BYTE_MUTATIONS[int(rng.integers(4))](content, rng)) for _ in range(2))]
@@ -300,22 +346,29 @@ def make_log(folder: Path, rng: Random) -> tuple[Path, list[str]]:
     return target, [kind, *done]
 
 
-def packed(path: Path, kind: str) -> bytes:
+PACKERS = ("gz", "bz2", "xz", "zst", "lz4", "tar", "tar.gz", "tar.bz2", "tar.xz", "tar.zst", "tar.lz4", "zip")
+ZIPPED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+TARRED = (tarfile.GNU_FORMAT, tarfile.PAX_FORMAT)
+"""How a zip archive is compressed; the formats of tar archives: those with names of any length."""
+
+
+def packed(path: Path, kind: str, rng: Random) -> bytes:
     """Return a log as a compressed file, or as an archive."""
-    if kind in ("tar", "tgz", "zip") or path.is_dir():
+    folder = "d" * int(rng.choice([1, 1, 90])) + "/" + "é" * int(rng.choice([0, 0, 120])) + path.name
+    if kind.startswith("tar") or kind == "zip" or path.is_dir():
         sink = io.BytesIO()
         files = sorted(path.iterdir()) if path.is_dir() else [path]
         if kind == "zip":
-            with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED) as archive:
+            with zipfile.ZipFile(sink, "w", int(rng.choice(ZIPPED))) as archive:
                 for file in files:
-                    archive.write(file, f"{path.name}/{file.name}")
-        else:
-            with tarfile.open(fileobj=sink, mode="w:gz" if kind == "tgz" else "w") as archive:
-                for file in files:
-                    archive.add(file, f"{path.name}/{file.name}")
-        if kind in ("tar", "tgz", "zip"):
+                    archive.write(file, f"{folder}/{file.name}")
             return sink.getvalue()
-        content = sink.getvalue()
+        with tarfile.open(fileobj=sink, mode="w", format=int(rng.choice(TARRED))) as archive:
+            for file in files:
+                archive.add(file, f"{folder}/{file.name}")
+        content, kind = sink.getvalue(), kind.removeprefix("tar").removeprefix(".")
+        if not kind:
+            return content
     else:
         content = path.read_bytes()
     import lz4.frame
@@ -342,7 +395,9 @@ def make_plain(folder: Path, rng: Random) -> tuple[Path, list[str]]:
         done = [str(rng.choice([doubles, numbers])(content, rng)) for _ in range(int(rng.choice([1, 10, 1000])))]
         path.write_bytes(content)
         return path, ["vendor types", *sorted(set(done))]
-    count, kind, wheels = int(rng.choice(COUNTS)), int(rng.integers(len(KINDS))), str(rng.choice(WHEELS))
+    weights = np.array([2.0 if number < MANY_KINDS else 1.0 for number in range(len(KINDS))])
+    kind = int(rng.choice(len(KINDS), p=weights / weights.sum()))
+    count, wheels = int(rng.choice(COUNTS)), str(rng.choice(WHEELS))
     done = []
     if rng.random() < MUTATED_COLUMNS:
         columns = asdict(drive(count))
@@ -353,8 +408,8 @@ def make_plain(folder: Path, rng: Random) -> tuple[Path, list[str]]:
         path = write(folder, columns, kind, wheels)
     else:
         path = Path(shutil.copytree(clean_log(count, kind, wheels), folder, dirs_exist_ok=True)) / name_of(kind)
-    container = KINDS[kind][0]
-    if container == "db3" and rng.random() < NO_METADATA:
+    container = " ".join(KINDS[kind])
+    if container.startswith("db3") and rng.random() < NO_METADATA:
         (path / "metadata.yaml").unlink()
         path = next(path.iterdir())
     if not done or rng.random() < 0.3:
@@ -577,6 +632,10 @@ WALL_FACTOR = 200
 """A worker that gets no share of the processor is no finding; one that waits is ended after this many limits."""
 
 
+TOO_LONG = re.compile("CPU time limit|killed after")
+"""Why a log is used once more: on a busy machine, and at the first use of a library, the same work takes longer."""
+
+
 class Worker:
     """A process that uses logs; where it does not come back or dies, that is a finding of its log."""
 
@@ -641,12 +700,12 @@ class Worker:
 def use_all(jobs: Iterator[Job], count: int, megabytes: int) -> Iterator[Result]:
     """Yield what becomes of logs in `count` processes."""
     workers = [Worker(megabytes) for _ in range(count)]
-    more = True
-    while more or any(worker.job is not None for worker in workers):
+    more, again, repeated = True, list[Job](), set[int]()
+    while more or again or any(worker.job is not None for worker in workers):
         for i in range(count):
-            if workers[i].job is None and more:
-                job = next(jobs, None)
-                more = job is not None
+            if workers[i].job is None and (more or again):
+                job = again.pop() if again else next(jobs, None)
+                more = more and job is not None
                 if job is not None:
                     if not workers[i].left:
                         workers[i].end()
@@ -655,8 +714,12 @@ def use_all(jobs: Iterator[Job], count: int, megabytes: int) -> Iterator[Result]
         wait([worker.connection for worker in workers if worker.job is not None], 0.2)
         for worker in workers:
             if (found := worker.result()) is not None:
-                worker.job = None
-                yield found
+                job, worker.job = worker.job, None
+                if job is not None and found[1] == "FOUND" and TOO_LONG.search(found[3]) and job.seed not in repeated:
+                    repeated.add(job.seed)
+                    again.append(job)
+                else:
+                    yield found
     for worker in workers:
         worker.end()
 

@@ -100,6 +100,7 @@ WRITERS = (
     ("json", "jsonschema", json_schema),
     ("cdr", "ros2msg", ros),
     ("cdr", "ros2idl", idl),
+    ("ros1", "ros1msg", ros),
     ("protobuf", "protobuf", protobuf),
 )
 
@@ -118,6 +119,7 @@ def write_log(path: Path, rng: Random) -> tuple[Path, list[str]]:
     text = make(fields, steps, int(rng.choice([1, 2, 8])))
     topics = int(min(rng.choice(TOPICS), max(MOST_FILE_CHARACTERS // len(text), 1)))
     alike, name = bool(rng.random() < 0.5), "x.T0" if encoding == "protobuf" else str(rng.choice(NAMES))
+    name = name.replace("/msg/", "/") if encoding == "ros1" else name
     with path.open("wb") as stream:
         writer = Writer(
             stream, chunk_size=1 << 26, compression=CompressionType.ZSTD, repeat_schemas=bool(rng.random() < 0.5)
@@ -129,9 +131,10 @@ def write_log(path: Path, rng: Random) -> tuple[Path, list[str]]:
                 ending = part(1, part(1, b"%d" % number)) if encoding == "protobuf" else b" " * number
                 schema = writer.register_schema(name, written, text + ending)
             channel = writer.register_channel(f"/wheel{number}", encoding, schema)
+            numbers = struct.pack("<d", 1.0) * 40
+            data = {"json": b'{"a": 1.0}', "cdr": b"\0\1\0\0" + numbers, "ros1": numbers}.get(encoding, b"")
             for message in range(2):
                 stamp = START_NS + message * 50_000_000
-                data = {"json": b'{"a": 1.0}', "cdr": b"\0\1\0\0" + struct.pack("<d", 1.0) * 40}.get(encoding, b"")
                 writer.add_message(channel, stamp, data, stamp)
         writer.finish()
     kind = "alike" if alike else "each its own"
