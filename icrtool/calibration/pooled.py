@@ -466,8 +466,8 @@ def use_notes(run: Run, *, alone: bool = True) -> tuple[Note, ...]:
         notes += run.document.excitation.notes
     if are_twist(run.document.streams) and run.config.wheels.twist_width_m is None:
         why = (
-            "the wheels were read from body twists, which hold the controller's own multipliers: "
-            "these numbers are right only where b and radius are those the twists were made with"
+            "the wheels were read from body twists, which hold the multipliers of the controller: the numbers refer to "
+            "the width and the radius with which the controller computed them; set wheels.twist_width_m to this width"
         )
         notes.append(note("wheels_from_twist", why))
     return tuple(notes)

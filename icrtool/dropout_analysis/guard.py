@@ -50,11 +50,11 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
     seconds = int(errors.counts.trials[h]) * summary.drive.duration_s / max(errors.states, 1)
     expected = min(int(errors.counts.trials[h]), seconds / LONGEST_RECORDING_STEP_S, MOST_TRIALS)
     if trials[least, h] < max(FEWEST_TRIALS, SMALLEST_SHARE_TRIED * expected):
-        rests = f"{names[least]} rests on {trials[least, h]:,} trials of {horizon}"
+        few = f"{names[least]} has only {trials[least, h]:,} trials of {horizon}"
         if errors.counts.trials[h] < FEWEST_TRIALS:
-            return note("few_trials", f"{rests}: the drive is too short")
-        of_icr = f"where icr has {errors.counts.trials[h]:,}"
-        return note("few_trials", f"{rests}, {of_icr}: are the stamps of the wheels regular?")
+            return note("few_trials", f"{few}: the drive is too short; drive further")
+        of_icr = f"and icr has {errors.counts.trials[h]:,}"
+        return note("few_trials", f"{few}, {of_icr}; check the stamps of the wheels (icrtool info -v)")
     hidden = [ICR_WORDS[column] for column in ICR_COLUMNS[:2] if summary.icr_of_drive(column) is None]
     icr, recommended = (rows[name][h].p95_m if name in rows else None for name in (FALLBACK_ROW, MAIN_ROW))
     if not hidden or icr is None or recommended is None:

@@ -213,7 +213,7 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "header_clock": Explanation(
         "info",
-        "The header stamps of all streams are of one clock far from log time, as in a simulation or a replay.",
+        "All header stamps come from one clock, and log time differs from it, as in a simulation or a replay.",
         "The header stamps are used.",
         "None is needed. `topics.clock` sets which stamps are used.",
     ),

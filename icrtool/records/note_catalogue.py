@@ -81,7 +81,7 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
     ),
     "few_trials": Explanation(
         "grave",
-        "A row of the report rests on few trials, or on few of those that other rows have.",
+        "A row of the report has few trials, or far fewer than other rows have.",
         "Its errors come from a chosen part of the drive.",
         "Drive further; check the stamps of the wheels (`icrtool info -v`).",
     ),

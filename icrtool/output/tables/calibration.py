@@ -65,7 +65,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
         Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
         *blocks_of_numbers(calibration.controller, calibration.width_m, icrs),
         Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?"),
-        Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
+        Facts([("not shown", unknown and f"too small for these drives; the usual values are used: {unknown}")]),
         Section(f"Motion model: {model_text(calibration.fitted)}", model, VERBOSE),
     ]
 
@@ -97,7 +97,7 @@ def calibration_file_blocks(calibration: Calibration, title: str) -> list[Block]
     term, *middle, meaning = table.head
     parameters: list[Block] = [
         table._replace(rows=named, head=(meaning, *middle, term)),
-        Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
+        Facts([("not shown", unknown and f"too small for these drives; the usual values are used: {unknown}")]),
         *sensor_tables(calibration),
     ]
     unfit = [one.text for one in unfit_reasons(calibration)]

@@ -217,12 +217,12 @@ def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
 
 
 def heading_lines(report: DropoutDocument) -> Iterator[str]:
-    """Yield a line with the remedy if the heading at the start makes most of the error of the best row."""
+    """Yield a line with the remedy if the heading at the start causes most of the error of the best row."""
     start_heading = UNSET if report.best is None else report.best.start_heading
     if report.best is not None and start_heading is not UNSET and start_heading.dominates:
         whole = f"{error_text(start_heading.p95_m)} after {report.best.horizon_m:g} m (95 %)"
-        remainder = f"{error_text(start_heading.aligned_p95_m)} remain with aligned headings"
-        yield f"the heading at the start makes most of the error: {whole}, of which {remainder}; {start_heading.mend}"
+        aligned = f"{error_text(start_heading.aligned_p95_m)} with aligned headings"
+        yield f"the heading at the start causes most of the error: {whole}, but {aligned}; {start_heading.mend}"
 
 
 def sensor_lines(report: DropoutDocument) -> Iterator[str]:

@@ -58,7 +58,7 @@ def test_a_row_of_few_trials_makes_the_run_unusable(report: DropoutReport, trial
     why = why_unusable(report.run_document, changed(report, "recommended", trials=trials), HELD_OUT)
     assert why is not None
     assert why.code == "few_trials"
-    assert f"recommended rests on {trials} trials of 10 m, where icr has " in why.text
+    assert f"recommended has only {trials} trials of 10 m, and icr has " in why.text
 
 
 def test_rows_that_contradict_each_other_do_so_only_where_the_icrs_are_not_shown(report: DropoutReport) -> None:
@@ -75,7 +75,7 @@ def test_rows_that_contradict_each_other_do_so_only_where_the_icrs_are_not_shown
 def test_the_report_of_such_a_run_states_no_distance_and_fails_its_limits(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    why = "recommended rests on 4 trials of 10 m"
+    why = "recommended has only 4 trials of 10 m"
     monkeypatch.setattr("icrtool.dropout_analysis.dropout_report.why_unusable", lambda *_: note("few_trials", why))
     found = dropout_report(run, gates=["recommended.p95@10m <= 100"])
     assert (found.document.usable, found.document.unusable_because) == (False, why)

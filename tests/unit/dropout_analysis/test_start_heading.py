@@ -79,6 +79,6 @@ def test_headings_that_are_off_make_most_of_the_error_and_the_answer_says_so(run
     assert bad.p95_m == pytest.approx(10.0 * np.sin(np.radians(10.0)), rel=0.3)
     assert bad.aligned_p95_m < 0.35 * bad.p95_m
     text = " ".join(format_dropout(dropout_report(misled, horizons_m=HORIZONS_M)).split())
-    assert "the heading at the start makes most of the error" in text
+    assert "the heading at the start causes most of the error" in text
     assert "or drive straight for some metres before GNSS is lost" in text
-    assert "makes most of the error" not in format_dropout(dropout_report(run, horizons_m=HORIZONS_M))
+    assert "causes most of the error" not in format_dropout(dropout_report(run, horizons_m=HORIZONS_M))
