@@ -368,6 +368,6 @@ def forms(host: str) -> set[str]:
             found.add(one.encode("idna").decode())
         with suppress(ValueError):
             found.add(str(ip_address(one.partition("%")[0])))
-        with suppress(OSError, UnicodeError):
+        with suppress(OSError, ValueError):
             found.add(socket.inet_ntoa(socket.inet_aton(one)))
     return found | ({"localhost", "127.0.0.1"} if found & {"localhost", "127.0.0.1"} else set())

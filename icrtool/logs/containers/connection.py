@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from icrtool.errors import LogError
 from icrtool.records.input_limits import server_timeout_s
 from icrtool.records.places import SCHEMES, UrlPath
-from icrtool.records.text import LONGEST_NAME, LONGEST_STORED, shortened
+from icrtool.records.text import LONGEST_NAME, LONGEST_TEXT, shortened
 
 Result = TypeVar("Result")
 
@@ -92,10 +92,19 @@ def _patience(scheme: str) -> dict[str, Any]:
 
 @cache
 def _short_pages() -> type[Any]:
-    """Return the class of answers of web servers whose whole body is not read beyond `LARGEST_LISTING_BYTES`."""
+    """Return the class of answers of web servers that begin in time, and are not read beyond a length.
+
+    The header has `server_timeout_s`, of whatever it consists; a body that is read whole has `LARGEST_LISTING_BYTES`.
+    """
+    import asyncio
+
     from aiohttp import ClientResponse
 
     class ShortPage(ClientResponse):
+        async def start(self, connection: Any) -> ClientResponse:  # noqa: ANN401 - of a library
+            async with asyncio.timeout(server_timeout_s()):
+                return await super().start(connection)
+
         async def read(self) -> bytes:
             if self._body is None:
                 body, began_s, quiet_s = bytearray(), time.monotonic(), server_timeout_s()
@@ -201,9 +210,14 @@ def _words_of(cause: BaseException, path: UrlPath) -> str:
         return f"its server sent nothing for {quiet}, or less than {rate} after them; --server-timeout sets the time"
     status = getattr(cause, "status", None)
     if isinstance(status, int):
+        message = " ".join(str(getattr(cause, "message", "")).split())
+        if not status:
+            return "its server redirects without an end"
         # the rest of such a text is the address, or another address to which the server redirected
-        return f"its server answered {status} {getattr(cause, 'message', '')}".strip()
-    return shortened(path.without_own_secrets(str(cause)), LONGEST_STORED) or type(cause).__name__
+        words = "gave no answer of HTTP:" if cause.__cause__ is not None else f"answered {status}"
+        return shortened(f"its server {words} {message}".strip(), LONGEST_TEXT)
+    words = " ".join(path.without_own_secrets(str(cause)).split())
+    return shortened(words, LONGEST_TEXT) or type(cause).__name__
 
 
 def _failures() -> tuple[type[Exception], ...]:

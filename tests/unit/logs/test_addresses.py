@@ -20,6 +20,7 @@ import pytest
 import icrtool
 from icrtool.cli.inputs import named_place
 from icrtool.errors import ConfigError, IcrToolError, LogError
+from icrtool.logs.containers import connection
 from icrtool.logs.containers.connection import check_redirect, filesystem
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.source import SavedBytes, find_logs_at
@@ -143,7 +144,12 @@ def test_no_chain_is_followed_behind_a_question_mark(scheme: str, behind: str) -
 
 @contextmanager
 def lying_server(
-    answer: bytes, forever: bytes = b"", *, pause_s: float = 0.0, stated: bytes = b"Content-Length: 1000000\r\n"
+    answer: bytes,
+    forever: bytes = b"",
+    *,
+    pause_s: float = 0.0,
+    stated: bytes = b"Content-Length: 1000000\r\n",
+    head: bytes = b"",
 ) -> Iterator[tuple[str, list[int]]]:
     """Answer HEAD with a size of 1 MB, and GET with what is given; count what is sent."""
     listening = socket.create_server(("127.0.0.1", 0))
@@ -154,7 +160,7 @@ def lying_server(
             try:
                 while request := client.recv(65536):
                     if request.startswith(b"HEAD"):
-                        client.sendall(b"HTTP/1.1 200 OK\r\n" + stated + b'ETag: "a"\r\n\r\n')
+                        client.sendall(head or b"HTTP/1.1 200 OK\r\n" + stated + b'ETag: "a"\r\n\r\n')
                         continue
                     asked = re.search(rb"Range: bytes=(\d+-\d+)", request)
                     client.sendall(answer.replace(b"RANGE", asked[1] if asked is not None else b""))
@@ -269,6 +275,46 @@ def test_a_server_that_sends_a_byte_now_and_then_is_given_up(kind: str, monkeypa
         read(UrlPath(url.replace("a.mcap", "folder/*.mcap") if read is find_logs_at else url))
     assert "sent nothing for 1 s, or less than 10 kB/s" in str(error.value)
     assert time.monotonic() - began < 15.0
+
+
+SLOW_HEADERS = {
+    "100 Continue without an end": (b"", b"HTTP/1.1 100 Continue\r\n\r\n"),
+    "a header without an end": (b"HTTP/1.1 200 OK\r\n", b"X"),
+    "headers without an end": (b"HTTP/1.1 200 OK\r\n", b"X: y\r\n"),
+}
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "folder/*.mcap"])
+@pytest.mark.parametrize("kind", SLOW_HEADERS)
+def test_a_server_whose_header_does_not_end_is_given_up(kind: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    monkeypatch.setenv(SERVER_TIMEOUT_S, "1")
+    began = time.monotonic()
+    read: Callable[[UrlPath], object] = find if "*" in name else open_log
+    with (
+        lying_server(*SLOW_HEADERS[kind], pause_s=0.05) as (url, _),
+        pytest.raises(LogError, match="sent nothing for 1 s"),
+    ):
+        read(UrlPath(url.replace("a.mcap", name)))
+    assert time.monotonic() - began < 15.0
+
+
+NO_ANSWERS = {
+    b"hello\n": "its server gave no answer of HTTP: Bad status line",
+    b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n": "its server gave no answer of HTTP: Invalid character",
+    b"HTTP/1.1 302 F\r\nLocation: /a.mcap\r\nContent-Length: 0\r\n\r\n": "its server redirects without an end",
+    b"HTTP/1.1 500 \x1b[2Jout\r\nContent-Length: 0\r\n\r\n": "its server answered 500",
+}
+
+
+@pytest.mark.parametrize("answer", NO_ANSWERS)
+def test_what_a_server_answers_in_place_of_a_log_is_stated(answer: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    monkeypatch.setattr(connection, "PAUSES_S", ())
+    with lying_server(answer, head=answer) as (url, _), pytest.raises(LogError, match=NO_ANSWERS[answer]) as error:
+        open_log(UrlPath(url))
+    assert str(error.value).isprintable()
+    assert "\\n\\n" not in str(error.value)
 
 
 def test_a_page_without_an_end_that_lists_a_folder_is_refused() -> None:
