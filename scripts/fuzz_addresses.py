@@ -362,8 +362,12 @@ def is_typed(host: str, shown: str) -> bool:
 
 def forms(host: str) -> set[str]:
     """Return the ways to write a host."""
+    from yarl import URL
+
     found = {host.lower(), unquote(host).lower()}
     for one in tuple(found):
+        with suppress(ValueError):
+            found.add(URL(f"http://{one}").raw_host or "")
         with suppress(UnicodeError):
             found.add(one.encode("idna").decode())
         with suppress(ValueError):

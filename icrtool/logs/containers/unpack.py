@@ -23,7 +23,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from gzip import GzipFile
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from tarfile import AREGTYPE, CONTTYPE, REGTYPE, SUPPORTED_TYPES, TarError, TarInfo
@@ -46,6 +45,13 @@ _PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED_SUFFIX})?$|
 _PIECE_BYTES = 1 << 20
 """Number of bytes that are unpacked at a time."""
 
+_FRAME_PIECE_BYTES = 1 << 16
+"""Number of bytes that a decoder of frames is given at a time. What is behind a frame is copied for the next one."""
+
+_MOST_FRAMES, _LEAST_FRAME_BYTES = 10_000, 100
+"""Number of frames that any file may have, and number of bytes for each further frame. The frames of parallel
+compressors have 64 kB and more."""
+
 _DECODER_BYTES = LARGEST_CHUNK_BYTES
 """Largest number of bytes that a decoder may hold."""
 
@@ -60,6 +66,9 @@ _LARGEST_EXTRA_BYTES = 1 << 16
 
 _LARGEST_READ_BYTES = 1 << 22
 """Largest piece that zipfile reads at once, such as an archive's directory [bytes]."""
+
+_ENCRYPTED = 1
+"""Bit of an entry of a zip archive that states that its content is encrypted."""
 
 _BEHIND = b"icrtool: behind the last frame"
 _TAR_BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
@@ -86,19 +95,60 @@ class _Frames:
 
     def __init__(self, make: Callable[[], Any], source: Readable) -> None:
         self._make, self._source, self._decoder = make, source, make()
+        self._frames, self._given = 1, 0
 
     def read(self, count: int, /) -> bytes:
         """Return the next bytes, at most `count`."""
         while True:
             data = b""
             if self._decoder.eof:
-                if not (data := self._decoder.unused_data or self._source.read(_PIECE_BYTES)):
+                if not (data := self._decoder.unused_data or self._next_piece()):
                     return b""
+                self._frames += 1
+                if self._frames > _MOST_FRAMES + self._given / _LEAST_FRAME_BYTES:
+                    raise ValueError(f"{self._frames:,} frames of little content")
                 self._decoder = self._make()
-            elif self._decoder.needs_input and not (data := self._source.read(_PIECE_BYTES)):
+            elif self._decoder.needs_input and not (data := self._next_piece()):
                 raise EOFError("no end mark")
             if out := self._decoder.decompress(data, max_length=count):
                 return bytes(out)
+
+    def _next_piece(self) -> bytes:
+        piece = self._source.read(_FRAME_PIECE_BYTES)
+        self._given += len(piece)
+        return piece
+
+
+class _Gzip:
+    """The decoder of a member of a gzip file, with the attributes of those of bz2 and lzma.
+
+    `gzip.GzipFile` reads the name in a header byte by byte.
+    """
+
+    def __init__(self) -> None:
+        self._decoder = zlib.decompressobj(wbits=31)
+        self._is_held = False
+
+    @property
+    def eof(self) -> bool:
+        """Whether the member has ended."""
+        return self._decoder.eof
+
+    @property
+    def unused_data(self) -> bytes:
+        """What stands behind the member, without the zeros that fill up a block."""
+        return self._decoder.unused_data.lstrip(b"\0")
+
+    @property
+    def needs_input(self) -> bool:
+        """Whether no further bytes come out without input."""
+        return not self._is_held
+
+    def decompress(self, data: bytes, max_length: int) -> bytes:
+        """Return bytes of the content, at most `max_length`."""
+        out = self._decoder.decompress(self._decoder.unconsumed_tail + data, max_length)
+        self._is_held = bool(self._decoder.unconsumed_tail) or len(out) == max_length
+        return out
 
 
 class _Zstd:
@@ -132,7 +182,7 @@ class _Zstd:
 
 DECODERS: dict[bytes, Callable[[Readable], Readable]] = {
     ZSTD_MAGIC: _Zstd,
-    b"\x1f\x8b": lambda source: GzipFile(fileobj=source, mode="rb"),  # type: ignore[call-overload]  # as above
+    b"\x1f\x8b": partial(_Frames, _Gzip),
     b"BZh": partial(_Frames, bz2.BZ2Decompressor),
     b"\x04\x22\x4d\x18": partial(_Frames, lz4.frame.LZ4FrameDecompressor),
     b"\xfd7zXZ\0": partial(_Frames, partial(lzma.LZMADecompressor, memlimit=_DECODER_BYTES)),
@@ -411,7 +461,8 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
             fields = _extra_fields(info.type, stream.exactly(min(info.size, _LARGEST_EXTRA_BYTES)))
             stream.skip(max(info.size - _LARGEST_EXTRA_BYTES, 0) + -info.size % _TAR_BLOCK_BYTES)
             name = fields.get(b"path", name.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
-            stated_size = int(fields[b"size"]) if fields.get(b"size", b"").isdigit() else stated_size
+            size_field = fields.get(b"size", b"")
+            stated_size = int(size_field) if re.fullmatch(rb"\d{1,18}", size_field) else stated_size
             continue
         if info.type == b"K":
             # the target of a link, of any length; the name of the next entry stays
@@ -491,6 +542,9 @@ def _zip_entries(file: BufferedReader, budget: _Budget) -> Iterator[tuple[str, _
                 # a file has a name; `is_dir` of Python 3.11 looks at its last letter
                 if not info.filename or info.is_dir():
                     continue
+                if info.flag_bits & _ENCRYPTED:
+                    budget.stop("log_part_unreadable", f"{LogText(info.filename)} is encrypted")
+                    return
                 if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2}:
                     budget.stop(
                         "log_part_unreadable", f"compression {info.compress_type} of {info.filename} is not known"

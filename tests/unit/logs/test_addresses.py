@@ -290,7 +290,7 @@ def test_a_server_whose_header_does_not_end_is_given_up(kind: str, name: str, mo
     pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
     monkeypatch.setenv(SERVER_TIMEOUT_S, "1")
     began = time.monotonic()
-    read: Callable[[UrlPath], object] = find if "*" in name else open_log
+    read: Callable[[UrlPath], object] = find_logs_at if "*" in name else open_log
     with (
         lying_server(*SLOW_HEADERS[kind], pause_s=0.05) as (url, _),
         pytest.raises(LogError, match="sent nothing for 1 s"),

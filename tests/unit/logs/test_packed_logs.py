@@ -529,3 +529,54 @@ def test_no_note_or_error_names_the_temporary_folder(tmp_path, temporary, damage
         said = [str(err)]
     assert said
     assert not [one for one in said if str(temporary) in one or "icrtool-" in one]
+
+
+@pytest.mark.parametrize("packing", [".gz", ".bz2", ".xz", ".lz4"])
+def test_a_file_of_very_many_empty_frames_is_refused_at_once(tmp_path, packing):
+    path = tmp_path / f"drive.mcap{packing}"
+    path.write_bytes(PACKERS[packing](b"") * 200_000)
+    begin = time.process_time()
+    with pytest.raises(LogError, match="frames of little content") as error:
+        open_log(path)
+    assert len(str(error.value).splitlines()) == 1
+    assert time.process_time() - begin < 2.0
+
+
+def test_a_gzip_file_whose_header_has_a_long_name_costs_little_time(tmp_path):
+    packed = bytearray(gzip.compress(MCAP.read_bytes(), compresslevel=1))
+    packed[3] |= 8  # a name follows
+    path = tmp_path / "drive.mcap.gz"
+    path.write_bytes(packed[:10] + b"x" * 8_000_000 + b"\0" + packed[10:])
+    begin = time.process_time()
+    assert content(path) == content(MCAP)
+    assert time.process_time() - begin < 8.0
+
+
+@pytest.mark.parametrize("count", [1, 7, 300, 1 << 16, 1 << 20])
+def test_members_of_a_gzip_file_come_out_as_python_s_own_module_reads_them(count):
+    rng = random.Random(count)
+    parts = [b"", bytes(200_000), rng.randbytes(150_000), b"a" * 65_536, rng.randbytes(3)]
+    packed = b"".join(gzip.compress(part) for part in parts) + bytes(512) + gzip.compress(b"end") + bytes(9)
+    stream, pieces = unpack.DECODERS[b"\x1f\x8b"](io.BytesIO(packed)), []
+    while piece := stream.read(count):
+        assert len(piece) <= count
+        pieces.append(piece)
+    assert b"".join(pieces) == gzip.decompress(packed)
+    cut = unpack.DECODERS[b"\x1f\x8b"](io.BytesIO(packed[:100_000]))
+    with pytest.raises(EOFError):
+        list(iter(lambda: cut.read(count), b""))
+
+
+@pytest.mark.parametrize("size", [b"9" * 5000, "²".encode(), b"-1", b""])
+def test_a_size_of_an_archive_that_is_no_number_is_not_used(tmp_path, size):
+    field = b" size=" + size + b"\n"
+    length = len(field) + len(str(len(field) + 4))
+    body = b"%d" % length + field
+    extra, entry = tarfile.TarInfo("x"), tarfile.TarInfo("drive.mcap")
+    extra.type, extra.size, entry.size = b"x", len(body), MCAP.stat().st_size
+    path = tmp_path / "drive.tar"
+    path.write_bytes(
+        extra.tobuf() + body + bytes(-len(body) % 512)
+        + entry.tobuf() + MCAP.read_bytes() + bytes(-entry.size % 512) + bytes(1024)
+    )  # fmt: skip
+    assert content(path) == content(MCAP)
