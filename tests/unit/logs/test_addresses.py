@@ -302,7 +302,6 @@ def test_a_server_whose_header_does_not_end_is_given_up(kind: str, name: str, mo
 NO_ANSWERS = {
     b"hello\n": "its server gave no answer of HTTP: Bad status line",
     b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n": "its server gave no answer of HTTP: Invalid character",
-    b"HTTP/1.1 302 F\r\nLocation: /a.mcap\r\nContent-Length: 0\r\n\r\n": "its server redirects without an end",
     b"HTTP/1.1 500 \x1b[2Jout\r\nContent-Length: 0\r\n\r\n": "its server answered 500",
 }
 
