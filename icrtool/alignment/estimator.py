@@ -281,7 +281,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     except np.linalg.LinAlgError:
         return None
     if not np.isfinite(covariance).all():
-        # exact data on one circle do not separate the parameters
+        # Exact data on a single circle give no finite estimate.
         return None
     covariance[HEADING_LAG, HEADING_LAG] += RESPONSE_STD_S**2
     covariance[WHEEL_SCALE, WHEEL_SCALE] += SCALE_STD**2
@@ -301,7 +301,7 @@ class MotionOfWindows:
         self.track, self.windows, self.b = windows.track, windows, width_m
         track = windows.track
         self.v, self.u = track.mean_speed, track.half_difference
-        # places are needed only at the begins and ends of windows, which are few of the fixes of a long drive
+        # Places are needed only at the begins and ends of windows. On a long drive these are few of the fixes.
         self.edge_t = track.place_t[np.stack([windows.begin, windows.end])]
         self.level = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
         self.turn_v, self.turn_w = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
@@ -365,7 +365,7 @@ class MotionOfWindows:
         """Return the heading as a unit vector, its rate [rad/s], and the terms of the speeds ahead and aside (n,)."""
         track = self.track
         ends = np.append(track.t, track.t[-1] + track.held[-1])
-        # a wheel speed acts along the heading of a later time, because a response delays both equally
+        # A wheel speed acts along the heading of a later time, because the response delays motion and heading equally.
         heading = track.heading_at(ends + x[HEADING_LAG]) + x[HEADING_OFFSET]
         smooth = np.interp(ends + x[HEADING_LAG], track.heading_t, self.smooth_heading)
         rate = np.where(track.held > 0.0, np.diff(smooth) / np.maximum(track.held, 1e-9), 0.0)

@@ -261,7 +261,7 @@ def _noisy_side(averaged: Floats, nearby: Floats, moves: Bools, at: int) -> slic
         return slice(0, 0)
     half = STRETCHES_PER_SIDE // 2
     if moves[before - half : before + half + 1].any() != moves[after - half : after + half + 1].any():
-        return slice(0, 0)  # fixes of any class are quieter where the robot parks
+        return slice(0, 0)  # while the robot parks, fixes of all classes have less noise
     left, right = max(float(averaged[before]), USUAL_M2), max(float(averaged[after]), USUAL_M2)
     if max(left, right) < SIDES_VARIANCE * min(left, right):
         return slice(0, 0)

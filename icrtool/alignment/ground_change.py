@@ -104,7 +104,7 @@ def find_changes(fit: AlignmentFit) -> GroundChanges | None:
     places = np.unique(np.concatenate([[0], places[(places > 0) & (places < len(turns.x))], [len(turns.x)]]))
     ways, costs = _best_partitions(turns, places)
     likelihood = [len(turns.x) / 2 * math.log(max(cost, 1e-12)) for cost in costs]
-    # the most likely number of changes first; the next one where a stretch does not show its ratio
+    # The most likely number of changes comes first, then less likely ones, until all stretches show their ratio.
     ranked = sorted(range(len(ways)), key=lambda count: likelihood[count] + CHANGE_GAIN * count)
     for count in ranked:
         if count == 0:

@@ -187,7 +187,7 @@ def estimate_heading(
     if absolute and math.isfinite(absolute[0].aligned_std):
         offset, std = problem.offset(noises)
         if abs(offset) <= EVIDENCE_SIGMAS * std:
-            # an offset that is not significant: the sensor is taken to be mounted along the robot
+            # If the offset is not significant, the sensor counts as mounted along the robot.
             problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
     return problem.solve(noises)
 
@@ -213,7 +213,7 @@ class _Problem:
         self.turn, self.absolute, self.G = turn, absolute, turn.integrated
         still_t, still_rate = still
         t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
-        # steps that measure nothing, between events far apart
+        # Events without a measurement fill long gaps between events.
         at = np.sort(t)
         far = np.flatnonzero(np.diff(at) > 2.0 * LONGEST_GYRO_STEP_S)
         steps = [
@@ -305,7 +305,7 @@ class _Problem:
         """Run the filter for given noises; courses with a common error have less weight."""
         events, model = self.events(noises), self.model(noises)
         passes = filter_headings(events, model)
-        # correlation of the errors of successive courses, from slip that the model lacks
+        # Slip that the model lacks correlates the errors of successive courses over ground.
         course = self.kind == COURSE
         z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
         # The first innovations are large because the states are not known yet.
@@ -324,7 +324,7 @@ class _Problem:
         """Return the estimate for given noises."""
         events, model, passes = self._forward(noises)
         states, covariances = smooth_headings(events, model, passes)
-        del passes  # for a long log as large as the result of the pass below
+        del passes  # frees memory for the pass below
         fixed = np.ones(len(model.x), np.bool_)
         fixed[[ANGLE, BIAS]] = False
         fixed[GYRO_STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
@@ -334,9 +334,9 @@ class _Problem:
         del covariances
         passes = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
         causal, of_causal = passes.x, passes.P
-        del passes, events  # as large as the arrays at each sample below
+        del passes, events  # frees memory for the arrays at each sample
         t, turn, turned_by_rate = self.t, self.turn, self.G
-        # at samples of the rate: carried on from the last event, or between events
+        # The heading at samples of the rate: causal from the last event on, smoothed between events.
         interval_s = float(np.median(np.diff(turn.t), overwrite_input=True))
         every = max(1, round(1.0 / (LARGEST_RATE_HZ * interval_s)))
         rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))[::every]
@@ -352,7 +352,7 @@ class _Problem:
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
         gain = 1 + states[-1, SCALE]
         smoothed = gain * turned_by_rate[rows] + np.interp(s, t, states[:, ANGLE] - gain * self.at)
-        # a rate may be the mean over the interval before its stamp, or after it
+        # A rate may be the mean over the interval before or after its stamp.
         delay_s = interval_s / 2.0 if turn.delay_std_s is None else turn.delay_std_s
         stamp = (turn.rate[rows] * delay_s) ** 2
         smoothed_std = np.sqrt(np.interp(s, t, psi_variance) + stamp)

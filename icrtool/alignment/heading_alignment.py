@@ -332,7 +332,7 @@ def refuse_stuck(log: RobotLog) -> None:
     left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
     gone = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
     ahead = np.concatenate([[0.0], np.cumsum(left - right)])
-    # differences of the sides that are too small a share of the distance for a turn are left out
+    # A difference of the sides that is a small share of the distance does not count as a turn.
     later = np.minimum(np.searchsorted(gone, gone + TURN_M), len(gone) - 1)
     turns = np.abs(ahead[later] - ahead) >= TURN_SHARE * (gone[later] - gone)
     ahead = np.concatenate([[0.0], np.cumsum(np.where(turns[:-1], np.diff(ahead), 0.0))])

@@ -211,7 +211,7 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
     best_heading, least, changes, epoch = None, math.inf, course_changes(track), int(log.wheels.stamp_ns[0])
     for gyro in log.gyros:
         rates = gyro_rates(track, changes, gyro, epoch)
-        # with a stated heading, which would fit to either sense of a turn rate, only the usual mounting is tried
+        # With a stated heading only the usual mounting is tried, because that heading would fit to both senses.
         for row, (turn, axis) in enumerate(rates if stated is None else rates[:1]):
             candidate = _derived(log, track, turn, gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})", stated)
             std = math.inf if candidate is None else candidate.estimate.median_std
@@ -313,7 +313,7 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
     stamps, rows = np.unique(log.heading.stamp_ns, return_index=True)
     if len(stamps) < 3:
         return None
-    # about a sensor's upward axis
+    # The rate is about the upward axis of the sensor.
     rates = np.zeros((len(stamps) - 1, 3))
     rates[:, 2] = -np.diff(unwrapped(log.heading.heading_rad)[rows]) / (np.diff(stamps) / 1e9)
     gyro = GyroAxes(log.topic("heading", "heading"), stamps[:-1] + np.diff(stamps) // 2, rates)

@@ -184,7 +184,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
     length_m : length of the windows in place of the computed one; 0: not given
     """
     travel, noise = track.travel, WINDOW_IN_POSITION_STD * min(track.place_std_m, 10.0)
-    # distance for which a wheel value is held while the robot moves, with its repetitions
+    # Distance for which a wheel value is held while the robot moves; repeated values count as one value.
     moving = np.diff(travel) > 0
     changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
     lasts_m = float(travel[-1]) / max(sum(changes) / 2, 1.0)

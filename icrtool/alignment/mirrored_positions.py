@@ -53,7 +53,7 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
             with_speeds = _with_turned_heading(with_speeds)
         check_streams(with_speeds)
     except (ConfigError, DataError):
-        # it is refused later, with its reason
+        # A log that cannot be used is refused later, with the reason.
         return log
     windows = windows_of_log(with_speeds, width)
     enough = min(len(windows.begin), len(windows.turn_begin)) >= FEWEST_OVERLAPPING
@@ -77,8 +77,7 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
         return log
     near = [one for one, cost in zip(candidates, costs, strict=True) if cost < min(costs) + DECISIVE]
     if by_gyro:
-        # Without a heading nothing decides between exchanges that fit equally well: their paths differ by one turn
-        # only.
+        # Without a heading nothing decides between exchanges that fit equally well: their paths differ by a turn.
         what, right = " or ".join(words for _, words, _ in near), near[0][2]
         witnesses = "gyro and wheels, which agree"
         what += " (or the gyro is upside down, and the sides are exchanged)"

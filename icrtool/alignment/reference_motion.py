@@ -241,7 +241,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     ----------
     quiet : (m,) knots that may be inside a window
     """
-    # intervals that no window spans
+    # Intervals between knots that no window may span.
     left_out = ~(quiet[1:] & quiet[:-1]) | (np.diff(knots.holes) > 0)
     windows = cut_drive_windows(knots.track._replace(slipping=np.append(left_out, False)), MOTION_WINDOW_M)
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
@@ -366,7 +366,7 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     windows = compare_with_wheels(knots, motion, first, last, 0.0)
     duration = knots.t[last] - knots.t[first]
     speed = np.diff(knots.track.distance) / np.diff(knots.t)
-    # largest speed of the wheels, without single samples
+    # Largest speed of the wheels; single samples do not count.
     slide = (SLIDE_MPS + motion.scale * float(np.quantile(speed, 0.99))) * duration
     # motion of the wheels in the time by which stamps may be wrong, before and after each step
     reach = (knots.t[last] + 3 * STAMP_STD_S, knots.t[first] - 3 * STAMP_STD_S)

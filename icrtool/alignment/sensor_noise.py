@@ -32,8 +32,9 @@ JUMP_SIGMAS = 8.0
 SMALLEST_JUMP_M = 0.1
 PERSISTS_S = 1.0
 PERSISTS_SHARE = 0.5
-"""Smallest jump [m]; time for which the fixes stay away after a jump [s]; largest part of the jump that they come back
-in this time, as a share. After an outlier the fixes come back."""
+"""Smallest jump [m]; time before and after a step over which the median positions are compared [s]; largest difference
+between the step and the change of these medians, as a share of the step, at which the step is a jump. After an outlier
+the positions come back."""
 
 NOISIER = 1.5
 """Ratio of measured to stated noise above which the measured noise is used."""
@@ -113,7 +114,7 @@ def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Compl
     with np.errstate(invalid="ignore"):
         usual_step = np.where(np.abs(step) <= OUTLIER_SIGMAS * scale, step, np.nan)
     product = -(usual_step[1:] * np.conj(usual_step[:-1])).real
-    # steps after which the fixes stay away
+    # A step is a jump if the fixes stay away after it.
     span = max(3, round(PERSISTS_S / usual)) if usual > 0 else 3
     with np.errstate(invalid="ignore"):
         row = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, JUMP_SIGMAS * scale))
@@ -142,8 +143,9 @@ def unbroken_intervals(interval_s: Floats) -> Floats:
 
 
 FIRST_FIXES, BAD_STEP_SPEEDS, BAD_STEP_M = 5, 3.0, 3.0
-"""Largest number of first fixes that may be bad. They are bad if the step after them exceeds this multiple of the
-wheels' distance by more than the noise and this distance [m], and if no later step does."""
+"""Largest number of first fixes that may be bad; multiple of the wheels' distance, and of the noise, that a step may
+have; distance [m] that a step may have in addition, if the noise is smaller. Fixes before a longer step are bad, if no
+later step is longer than this."""
 
 
 def without_bad_start(log: RobotLog) -> RobotLog:
@@ -281,7 +283,7 @@ def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn
     std_m = _measured(place, values, LEAST_POSITION_STD_M, USUAL_POSITION_STD_M)
     if math.isnan(std_m) or not log.heading_is_of_position or turn_stated or settings.heading_std_deg != "auto":
         return std_m, math.nan
-    # one axis: `white_std_m` shares the variance among two
+    # A heading has one axis, but `white_std_m` divides the variance among two axes.
     least, usual = (angle / math.sqrt(2.0) for angle in (LEAST_HEADING_STD_RAD, math.radians(USUAL_HEADING_STD_DEG)))
     return std_m, math.sqrt(2.0) * _measured(turn, log.heading.heading_rad, least, usual)
 

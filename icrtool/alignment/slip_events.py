@@ -169,7 +169,7 @@ def _find_events(
         free[extent.first : extent.last] = False
         outside[max(extent.first - 1, 0) : extent.last + 2] = False
         far = float(distance2[at])
-        # the probability that chi-squared with 3 degrees of freedom is larger
+        # Probability of a larger value of chi-squared with 3 degrees of freedom.
         tail = math.erfc(math.sqrt(far / 2)) + math.sqrt(2 * far / math.pi) * math.exp(-far / 2)
         events.append(
             SlipEvent(
@@ -337,7 +337,7 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
         last = int(np.argmax(grown)) + 1
         if grown[last - 1] <= 0.0:
             return None
-        # the shortest part with that sum
+        # Of all parts with this sum, the shortest.
         first = core.start + last - 1 - int(np.argmin(sums[:last][::-1]))
         last += core.start
         last += _growth(steps, error, shares, usable, range(last, len(usable)))
@@ -360,7 +360,7 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
     end_s = float(t[span.stop - 1]) + time_in(span.stop - 1, 1.0) + time_in(span.stop, 0.0)
     if end_s - begin_s < SHORTEST_EVENT_S or span.stop - span.start < FEWEST_EVENT_STEPS:
         return None
-    # where the wheels stand there is no motion to miss, and rounding must not count as evidence
+    # Where the wheels stand, no motion can be missing; rounding must not count as evidence.
     if not steps.path_m[span].any():
         return None
     return _measured(steps.rows(span), span, shares, begin_s, end_s)

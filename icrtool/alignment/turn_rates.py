@@ -170,7 +170,7 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     of_x, of_delay = (product(centred(-one)).imag / square for one in (swing, speed * swing))
     of_bias = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
     of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
-    # about no bias, no x and no delay
+    # The angle is stated for zero bias, zero x_icr and zero delay.
     bias_at = np.interp(t[end], turn.t, guess.bias)
     angle = np.angle(displacement * swing[end]) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
     courses = Courses(
@@ -225,7 +225,7 @@ def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Fl
     if len(rows) > 2:
         bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
         far = bend > JUMP_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
-        # the path also bends at the neighbours of a spike, by half of the angle
+        # A spike also bends the path at its two neighbours, by half of the angle.
         spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
         kept = np.concatenate([[True], ~spike, [True]])
         t, place = t[kept], place[kept]
@@ -362,7 +362,7 @@ def _bridged(t: Floats, rate: Floats, track: Track) -> TurnRate:
     residuals = there[measured] - factor * apart[measured]
     wheels = hole & (track.held > 0.0)
     order = np.argsort(np.concatenate([t, track.t[wheels]]), kind="stable")
-    # in a hole that the wheels do not cover either, the robot may turn as it does elsewhere
+    # In a hole that the wheels do not cover, the standard deviation is the rms turn rate of the drive.
     covered_s = np.interp(holes, track.t, np.concatenate([[0.0], np.cumsum(track.held[:-1])])) @ [-1.0, 1.0]
     covered = covered_s > COVERED_SHARE * (holes[:, 1] - holes[:, 0])
     by_wheels = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else LEAST_HOLE_STD_RADPS

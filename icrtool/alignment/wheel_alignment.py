@@ -150,7 +150,7 @@ def dead_or_copied(log: RobotLog) -> list[Note]:
     interval = unbroken_intervals(np.diff(seconds, append=seconds[-1:]))
     for side, still, moving in (("left", left, right), ("right", right, left)):
         still_m, gone = np.cumsum(still * interval), np.cumsum(np.abs(moving) * interval)
-        # the longest distance of one side over which the other hardly moves, compared at every metre
+        # The longest distance of one side over which the other side hardly moves, searched in steps of a metre.
         rows = np.append(rows_at_steps(gone, 1.0), len(gone) - 1)
         moves = np.flatnonzero(np.abs(np.diff(still_m[rows])) > NEVER_MOVES_SHARE * np.diff(gone[rows]))
         begins, ends = rows[np.append(0, moves + 1)], rows[np.append(moves, len(rows) - 1)]
@@ -269,7 +269,7 @@ def _find_scales(
     (asymmetry, asymmetry_std), (turn, turn_std) = fit.estimate("asymmetry"), fit.estimate("turn")
     if turn <= 0.0:
         return (factor, factor), notes
-    # left over right scale, minus 1, to first order
+    # Ratio of the left to the right scale, minus 1, to first order.
     difference, std = asymmetry / turn, math.hypot(asymmetry_std, asymmetry * turn_std / turn) / turn
     if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, EVIDENCE_SIGMAS * std):
         return (factor, factor), notes
@@ -401,7 +401,7 @@ def find_filtering(fit: AlignmentFit) -> str:
     noise_s, short_s = max(NOISE_S, resolved_s), max(SHORT_S, resolved_s)
     middle_s = max(MIDDLE_S, MIDDLE_IN_SHORT * short_s) if track.measured_t is not None else MIDDLE_S
     if long_s < SHORTEST_LONG_S / MIDDLE_S * middle_s:
-        # the reference does not resolve the turns of a filter
+        # The reference has too few headings to show the effect of a filter on turns.
         return ""
     comparisons = compare_turns(track, fit.width_m, delay, (noise_s, short_s, middle_s, long_s))
     if not comparisons:

@@ -101,7 +101,7 @@ def calibrated_drive(
         constants = constants._replace(gyro_bias_radps=usual.mean.gyro_bias_radps)
         learned = _with_biases(recording if past is None else past, fitted, constants, usual.std.gyro_bias_radps)
     knows = _knows([name for name in names if name not in unknown], unknown)
-    # both rows of a calibration hold offset and delay: a contradiction is noted once
+    # Both rows of a calibration hold offset and delay, so a contradiction is noted for the first row only.
     notes = contradictions(row, sensors, ["gyro_delay_s"] if with_gyro else names)
     return CalibratedDrive(KnownDrive(recording, learned), sensors, knows, tuple(notes))
 

@@ -266,7 +266,7 @@ def forecast_plan(
         why = f"a speed that is zero, no number, or beyond {FASTEST_MPS:g} m/s"
         raise DataError("plan", why, "give speed_mps in m/s, negative in reverse")
     speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_PLAN_MPS)
-    # a corner of the plan is driven as a curve over one track width, not on the spot: speeds are averaged over it
+    # A corner of the plan is driven as a curve over one track width, not on the spot: the speeds are averaged over it.
     width = max(round(calibration.width_m / STEP_M), 1)
     padded = np.pad(unwrapped(np.angle(step * np.sign(speed))), (width // 2, width - 1 - width // 2), mode="edge")
     direction = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")

@@ -262,7 +262,7 @@ def errors_without(
     """
     track, distance = recording.track, recording.track.distance
     errors = TrialErrors.none(trials.ends.shape)
-    # one horizon after the other, in the order in which the ends lie in memory
+    # The horizons are computed in the order in which the ends lie in memory.
     column, row = np.nonzero(trials.ends.T >= 0)
     start, end = trials.starts[row], trials.ends[row, column]
     for fold, some in left_out(folds, i, distance[start], distance[end]):
@@ -288,7 +288,7 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
     pool = Pool([cut_windows(one, pooled=pooled) for one in recordings], [one.width_m for one in recordings])
     fits = {name: pool.fit(MODELS[name]) for name in names}
     if FIVE in fits:
-        # all logs have the clocks of one robot: many logs show a constant delay no better than one log
+        # All logs have the clocks of one robot, so many logs show a constant delay no better than a single log.
         off = float(np.sqrt(np.mean([one.x_clock_std_m**2 for one in recordings])))
         fits[FIVE] = fits[FIVE].with_clock_error(off)
     if all(one.track.gyro is not None for one in recordings):

@@ -199,7 +199,8 @@ def _settings(parameters: Mapping[str, documents.SensorParameter], run: Run) -> 
     """Return the settings of parameters that are known well enough, and are large enough, to be configured."""
     wheels = run.config.wheels
     left, right = (1.0 if given == "auto" else given for given in (wheels.left_scale, wheels.right_scale))
-    # setting, parameter, neutral value, least difference from it, present value that the estimate is multiplied by
+    # Columns: setting, parameter, neutral value, smallest difference from it, present value that the estimate
+    # multiplies.
     rows = (
         ("frames.heading_offset_deg", "heading_offset_deg", 0.0, 0.3, 1.0),
         ("frames.reference_delay_s", "gnss_delay_s", 0.0, RESPONSE_S, 1.0),

@@ -160,7 +160,7 @@ def set_up_filter(
         heading_z=headings.heading_rad[sample],
         heading_r=headings.var_rad2[sample],
         change_t=np.empty(0),
-        # no events in a forced outage: the run must not use findings there that came from fixes
+        # A forced outage has no slip events, because these were found with the fixes in it.
         slipping=intervals_in(wheels.stamp_ns, events) & ~intervals_in(wheels.stamp_ns, outages_ns),
     )
     start = initial_icrs(config) if start is None else start

@@ -217,7 +217,7 @@ def run_adaptively(
     )
     if all(not len(one) or one.mean() <= TOLERATED_NIS for one in nis):
         return parameters, output, noise
-    del output, nis  # of a long log, as large as all that the next run makes
+    del output, nis  # frees memory for the next run
     wander_rad, largest = sensors.facts.turn_wander_rad, LARGEST_HEADING_DEGPS
     if wander_rad is not None:
         largest = min(largest, STEP * math.degrees(wander_rad) / math.sqrt(REFERENCE_STEP_S))

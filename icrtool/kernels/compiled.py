@@ -96,7 +96,7 @@ class _Arguments:
             # This takes a tenth of the time of `ctypes.data`; only an array without elements needs `ctypes.data`.
             address = ctypes.addressof(_BYTE.from_buffer(cast(Any, value))) if value.size else value.ctypes.data
             self.types.append((value.dtype, value.ndim))
-            # owner, parent, size, size of an item, address, shape, strides
+            # The words of an array: owner, parent, size, size of an item, address, shape, strides.
             self.words += (None, None, value.size, value.itemsize, address, *value.shape, *value.strides)
             self.forms += _ARRAY_FORM + (_INTEGER,) * (2 * value.ndim)
         elif isinstance(value, tuple):
@@ -205,7 +205,7 @@ class Kernel:
         types = tuple(arguments.types)
         if types not in self._functions:
             with _lock:
-                # another thread may have been first
+                # Another thread may have compiled the kernel meanwhile.
                 if types not in self._functions:
                     self._functions[types] = self._function(types, values, arguments)
         run = self._functions[types]
@@ -454,7 +454,7 @@ def cache_places() -> list[Path]:
         return [Path(named_place)]
     places = [Path(__file__).parent / "__pycache__"]
     users = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    # a container's user may have no home
+    # The user of a container may have no home directory.
     with suppress(RuntimeError):
         places.append((users if users.is_absolute() else Path("~/.cache").expanduser()) / "icrtool")
     return places
@@ -475,7 +475,7 @@ def _keep(name: str, content: bytes) -> None:
     place = writable_place()
     if place is None:
         return
-    # readable for other users: one user builds an image, another one runs it
+    # Other users may read the file: one user builds an image, another user runs it.
     temporary = place / f"{name}.{os.urandom(8).hex()}"
     with suppress(OSError):
         try:

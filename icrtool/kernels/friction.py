@@ -124,7 +124,7 @@ def slide(
         sum_xx += contact_x[i] * contact_x[i]
         sum_yy += contact_y[i] * contact_y[i]
     north, east, psi = pose[0, 0], pose[0, 1], pose[0, 2]
-    # velocity of the centre of mass, track speeds, commands, acceleration that the load follows, distance
+    # The state: velocity of the centre of mass, track speeds, commands, acceleration that the load follows, distance.
     u, w, omega = 0.0, 0.0, 0.0
     left, right, command_left, command_right = 0.0, 0.0, 0.0, 0.0
     a_x, a_y, driven = 0.0, 0.0, 0.0

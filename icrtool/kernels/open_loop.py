@@ -149,7 +149,7 @@ def open_loop_pieces(track: Track, icrs: FrozenIcrs, start: int, end: int) -> It
     """
     turned, place = 0.0, 0j
     ahead = cmath.exp(1j * track.heading[start])
-    for lo in range(start, end, ROWS_AT_ONCE):  # paths of whole drives are as long as a column of the run
+    for lo in range(start, end, ROWS_AT_ONCE):  # a path of a whole drive is as long as a column of the run
         some = slice(lo, min(lo + ROWS_AT_ONCE, end))
         y_icr_right, y_icr_left, x_icr = (column if len(column) == 1 else column[some] for column in icrs)
         over = track.held[some] / np.maximum(np.abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M)
@@ -274,7 +274,7 @@ def sum_moments(
     for i in range(len(left)):
         real, imag = 0.0, 0.0
         if left[i] != 0.0 or right[i] != 0.0:
-            # standstill adds nothing: a parked robot costs no sine
+            # A standstill adds nothing to the sums, so no sine is computed for a parked robot.
             real, imag = math.cos(a_centre * turn[i]), math.sin(a_centre * turn[i])
         for m in range(moments):
             c = moments - 1 - m
@@ -361,7 +361,7 @@ def solve_block(
     north, east, heading = columns[3:]
     rows, frozen = np.zeros((min(max(last - starts.start, 0), MAX_BLOCK) + 1, plan.moments, 4)), np.zeros((0, 7))
     for steps in wheel_steps(columns, starts.start, last, plan.first_turn):
-        # the starts are all among the first states
+        # All starts are among the first states.
         if steps.first == starts.start:
             turn = steps.turn[: starts.stop - starts.start]
             own = FrozenIcrs(*(column[: len(turn)] for column in icrs))
@@ -395,7 +395,7 @@ def fill_open_loop_errors(
     columns, icrs = compiled_columns(track), compiled_icrs(icrs)
     constant, size = len(icrs.x_icr) == 1, MAX_BLOCK
     while row_lo < starts:
-        # a robot that hardly moves has long windows: longer blocks share them
+        # A robot that hardly moves has windows of many states, which the starts of a longer block share.
         first_window = int(ends[:, row_lo].max(initial=-1)) - lo - row_lo
         row_hi = min(row_lo + min(max(CONSTANT_BLOCK if constant else BLOCK, first_window), size), starts)
         while True:

@@ -171,7 +171,7 @@ def robust_least_squares(
         weights = robust_weights(residuals, scale, overlap)
         step, decrease, _ = eliminate(residuals, jacobian, weights, parts, pull, x - prior_mean)
         if decrease < settled**2:
-            # a short step: the residuals follow it to first order, without a further evaluation
+            # The residuals after a short step are computed to first order, without a further evaluation.
             x, residuals = x + step, residuals + parts.change(jacobian, step)
             break
         before = _cost(residuals / scale, overlap, pull, x - prior_mean)
@@ -183,7 +183,7 @@ def robust_least_squares(
             step = step / 2.0
             tried = evaluate(x + step)
         else:
-            # no fraction of the step lowers the cost: with noisy data the Jacobian shows no better estimate
+            # No fraction of the step lowers the cost: with this Jacobian there is no better estimate.
             break
         x, (residuals, jacobian) = x + step, tried
         if before - after < settled**2:
@@ -216,7 +216,7 @@ def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
     if kind is None:
         return np.full(len(residuals), max(mad_std(residuals, 0.0), SMALLEST_SCALE))
     scale = np.empty(len(residuals))
-    # kinds are few, and numbered from zero: counting them is faster than sorting
+    # There are few kinds, numbered from zero, so that counting is faster than sorting.
     for one in np.flatnonzero(np.bincount(kind)):
         mine = kind == one
         scale[mine] = max(mad_std(residuals[mine], 0.0), SMALLEST_SCALE)

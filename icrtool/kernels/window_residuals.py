@@ -62,7 +62,7 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
     at : (m,) time of each knot [s], ascending
     """
     k, m = len(parameters), len(at)
-    # the step in which each time lies, and how much of it has passed; a gap's speeds end with its step
+    # The step in which each time lies, and the time since its begin; in a gap the speeds end with the step.
     row = np.maximum(np.searchsorted(track.t, at, side="right") - 1, 0)
     held = track.held[row]
     part = np.divide(np.clip(at - track.t[row], 0.0, held), held, out=np.zeros(m), where=held > 0.0)

@@ -197,7 +197,7 @@ def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:
     samples = samples_a_step(recording, pooled_s)
     if samples == 1:
         return recording.wheels()
-    # some at a time, to bound memory
+    # The samples are joined some at a time, to bound the memory.
     rows, into = max(ROWS_AT_ONCE // samples, 1) * samples, (samples - 1) / (2.0 * samples)
     parts = []
     for lo in range(0, len(recording.track.t), rows):
