@@ -37,7 +37,7 @@ from icrtool.records.tables import RobotLog
 
 
 def align(log: RobotLog, config: Config) -> Measurements:
-    """Find the errors of the streams of a log, and correct what is certain.
+    """Return the streams of a log with their certain errors corrected, and all errors that were found.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     Returns
     -------
     Measurements
-        The streams with every correction applied, and what was found.
+        The streams with every correction applied, and the findings.
 
     Raises
     ------

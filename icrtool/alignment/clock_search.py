@@ -54,7 +54,7 @@ class Shifts(NamedTuple):
     Attributes
     ----------
     gnss, heading : times of positions and of headings; 0 for a stream that was not moved
-    notes : what was found
+    notes : the findings
     """
 
     gnss: float
@@ -70,7 +70,7 @@ def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Con
 
     Returns
     -------
-    log; the configuration in which no configured delay is left; what was moved
+    log; the configuration in which no configured delay is left; the shifts that were applied
     """
     frames = config.frames
     delays_s: dict[str, float] = {
@@ -118,7 +118,7 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
 
     Returns
     -------
-    log; the configuration with which it is to be aligned, in which no configured delay is left; what was moved
+    log; the configuration for its alignment, in which no configured delay is left; the shifts that were applied
     """
     frames, notes = config.frames, list[Note]()
     free = frames.reference_delay_s == "auto", frames.heading_delay_s == "auto"

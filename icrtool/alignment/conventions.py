@@ -126,7 +126,7 @@ class _Shown(NamedTuple):
 def decide_conventions(
     windows: DriveWindows, *, metric: bool, gyro_sense: int = 0, mirror_allowed: bool = True
 ) -> Decision:
-    """Compare all hypotheses.
+    """Return the most likely of all hypotheses.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ class NamedFit(NamedTuple):
 def senses_by_distance(track: Track) -> Convention:
     """Return the convention that distances alone show, for a drive without a heading: which side counts backwards.
 
-    Either side may be the reversed one; the choice is the one with which the robot drives forward.
+    Either side may be reversed; the convention with which the robot drives forward is chosen.
     """
     _, step, left, right = cut_chords(track)
     chord = np.abs(step)

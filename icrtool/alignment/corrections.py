@@ -273,7 +273,7 @@ def _name_streams(
     Returns
     -------
     log with the chosen convention, as sent in preset ``paper``; its heading where it was estimated; the convention;
-    windows with it in any preset; what to report; whether no side is dead or a copy of the other
+    windows with this convention, in any preset; findings; whether no side is dead or a copy of the other side
     """
     corrects, derived, senses = config.filter.rules.corrects, None, AS_NAMED
     log = with_scaled_wheels(log, *configured_scales(config))

@@ -262,7 +262,7 @@ m."""
 
 
 def check_streams(log: RobotLog) -> None:
-    """Refuse streams that cannot be used together.
+    """Raise where streams cannot be used together.
 
     Raises
     ------

@@ -91,7 +91,7 @@ class Disagreements(NamedTuple):
 
 
 def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
-    """Find the spans in which the robot did not follow its wheels, and the spans in which the reference jumps.
+    """Return the spans in which the robot did not follow its wheels, and the spans in which the reference jumps.
 
     Parameters
     ----------

@@ -14,8 +14,8 @@ from icrtool.records.samples import HeadingSamples
 from icrtool.records.tables import LARGEST_STATE, RobotLog
 
 SPARSE_S = 0.5
-"""Usual interval between headings above which they are carried by the wheels [s]. Turns are compared over 1 s, which a
-rarer heading does not resolve by itself."""
+"""Usual interval between headings above which they are carried by the wheels [s]. Turns are compared over 1 s; rarer
+headings do not resolve such turns."""
 
 LONGEST_CARRIED_S = 30.0
 """Longest interval in which the wheels carry a heading [s]. A longer one holds a stop or an outage."""
@@ -102,7 +102,7 @@ FEWEST_IN_CURVES = 20
 
 
 def without_interpolated(log: RobotLog) -> RobotLog:
-    """Return the log with the nodes of positions that are linear between nodes; the same log where none are.
+    """Return the log with the nodes of positions that are linear between nodes; else the same log.
 
     Positions between the nodes are no measurements. A heading is reduced to its nodes where it is linear as well.
     """

@@ -214,7 +214,7 @@ def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Fl
 
     Returns
     -------
-    length of the windows [m]; times and places of the fixes, without those that lie far from both neighbours; rows of
+    length of the windows [m]; times and places of the fixes, without fixes that lie far from both neighbours; rows of
     these (w,), first and last of each window
     """
     std = min(track.place_std_m, 10.0)

@@ -120,8 +120,8 @@ def bridge_gaps(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[Wheel
 
     Notes
     -----
-    The positions before and after a gap give the distance of each side in it. It is driven at constant speed, in steps
-    as long as the usual interval.
+    The positions before and after a gap give the distance of each side in the gap. The added samples drive this
+    distance at constant speed, in steps as long as the usual interval.
     """
     interval = np.diff(wheels.stamp_ns) / 1e9
     usual = float(np.median(interval)) if len(interval) else math.inf
@@ -329,7 +329,7 @@ class Turns(NamedTuple):
 
 
 def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Sequence[float]) -> list[Turns]:
-    """Compare the turns of heading and wheels over windows of some lengths; empty where one length has too few windows.
+    """Return the turns of heading and wheels over windows of some lengths; empty if a length has too few windows.
 
     Parameters
     ----------

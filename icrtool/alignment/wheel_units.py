@@ -261,7 +261,7 @@ def _restarts(stamps: Ints, left: Floats, right: Floats) -> Bools:
 
 
 def _spikes(speed: Floats) -> Bools:
-    """Mark single samples (n,) far faster than the samples before and after them, and than almost all others."""
+    """Return which single samples (n,) are far faster than their neighbours and than almost all other samples."""
     size = np.abs(speed)
     if len(size) < 2:
         return np.zeros(len(size), np.bool_)
@@ -272,7 +272,7 @@ def _spikes(speed: Floats) -> Bools:
 
 
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
-    """Compare distances by reference and wheels over `chord_s`; None where there are too few spans.
+    """Return the ratio of the distances by reference and wheels over `chord_s`; None where there are too few spans.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Row ``adaptive`` of a report: what `icrtool.AdaptiveModel` predicts at each start, from the past alone."""
+"""Row ``adaptive`` of a report: the predictions of `icrtool.AdaptiveModel` at each start, from the past alone."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class KnownDrive:
 
     Attributes
     ----------
-    learned : what was known, in order of time; the first one before the drive
+    learned : the known models and constants, in order of time; the first entry holds before the drive
     steps : the wheel samples joined; None: single samples
     """
 
@@ -67,7 +67,7 @@ class KnownDrive:
     steps: Track | None = None
 
     def errors(self, trials: Trials, *, turned: bool = False) -> TrialErrors:
-        """Return the errors of trials, each with what was known at its start; `turned`: with the gyro."""
+        """Return the errors of trials, each with the model that was known at its start; `turned`: with the gyro."""
         errors = TrialErrors.none(trials.ends.shape)
         for number, some in self._by_learned(trials.starts):
             column, row = np.nonzero(trials.ends[some].T >= 0)

@@ -37,7 +37,7 @@ class CalibratedDrive(NamedTuple):
     Attributes
     ----------
     drive : the log, and the model and constants that were known at each time of it
-    sensors : the constants that it holds, and those of the log
+    sensors : the constants that the calibration holds, and the constants of the log
     knows : where its constants come from, in words
     notes : constants that the log contradicts
     """
@@ -75,7 +75,7 @@ def calibrated_drive(
 
     Notes
     -----
-    Constants are held in total, corrections before the fit included: what this log had corrected is subtracted. The
+    Held constants include the corrections before a fit, so the corrections of this log are subtracted from them. The
     bias of a gyro is learned from the turns before each start, from the held one on.
     """
     fitted = model_for(calibration, recording, with_gyro=with_gyro)

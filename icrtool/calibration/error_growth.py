@@ -1,9 +1,9 @@
 """How the error of a motion model grows along a path, and its forecast for a path that is driven without GNSS.
 
 The position error of a drive without GNSS has two parts. The first part comes from the covariance of the parameters; it
-is carried to the path by derivatives. The second part is what the model leaves out. Six sources of error describe it,
-each with a variance: the heading at the start, a constant error of the turn rate, a proportional error of the turns, a
-random walk of the turn rate, a proportional error of the speed, a random walk of the speed.
+is carried to the path by derivatives. The second part comes from effects that the model leaves out. Six sources of
+error describe it, each with a variance: the heading at the start, a constant error of the turn rate, a proportional
+error of the turns, a random walk of the turn rate, a proportional error of the speed, a random walk of the speed.
 `icrtool.calibration.held_out` measures the variances.
 """
 

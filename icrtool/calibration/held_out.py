@@ -164,7 +164,7 @@ class HeldOut:
         return (*HELD_OUT, *turned)
 
     def score(self, name: str) -> HeldOutRow:
-        """Return a row."""
+        """Return the row of a model by its name."""
         return next(score for score in self.scores if score.name == name)
 
     def without(self, name: str, fold: Fold) -> Prediction | None:
@@ -277,7 +277,7 @@ def errors_without(
 
 
 def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MODELS)) -> dict[str, PooledFit]:
-    """Fit motion models to recordings, with a gyro too where every recording has one.
+    """Return motion models fitted to recordings, with a gyro too if every recording has a gyro.
 
     Raises
     ------
@@ -297,7 +297,7 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
 
 
 def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HELD_OUT_HORIZONS_M) -> HeldOut:
-    """Fit the motion models, and test each on what it was not fitted to.
+    """Return the motion models fitted to recordings, each tested on data that it was not fitted to.
 
     Parameters
     ----------

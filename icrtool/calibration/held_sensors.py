@@ -1,9 +1,9 @@
 """Constants of the sensors in a calibration: measured in each of its logs, pooled, and held in a further log.
 
-A robot's sensors are installed once. Heading offset and delays of a log are what was corrected before the fit and what
-the windows show on top, so that logs with different corrections can be compared. A calibration holds their mean over
-its logs, with the spread between drives. The bias of a gyro changes with its temperature: a row with a gyro learns it
-from the drive before each start.
+A robot's sensors are installed once. Heading offset and delays of a log are the sum of the corrections before the fit
+and the remainder that the windows show, so that logs with different corrections can be compared. A calibration holds
+their mean over its logs, with the spread between drives. The bias of a gyro changes with its temperature: a row with a
+gyro learns it from the drive before each start.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def _further(found: Floats, usual_std: float) -> tuple[float, float]:
 
 
 def remaining_constants(total: KnownConstants, corrected: LogConstants) -> KnownConstants:
-    """Return what is left of constants after corrections that were made before; NaN where they are not known."""
+    """Return constants minus the corrections that were made before; NaN where they are not known."""
     return total._replace(mean=total.mean.minus(corrected))
 
 

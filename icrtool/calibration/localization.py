@@ -58,7 +58,8 @@ class Localization(NamedTuple):
     twist : variances of the wheels' v_x, v_y [m^2/s^2] and yaw rate [rad^2/s^2], of one message
     gyro_rate : variance of the gyro's yaw rate [rad^2/s^2], None without a gyro
     process : variances for each second, by the name of its state
-    declination_rad, yaw_offset_rad : what its navsat_transform_node adds to the yaw of the IMU; None where not shown
+    declination_rad, yaw_offset_rad : angles that its navsat_transform_node adds to the yaw of the IMU; None where not
+        shown
     wheel_topic, imu_topic : topics of the log, empty where it has none of the types
     left_out : parameter and reason of each number that the drive does not show
     """
@@ -217,7 +218,7 @@ def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
 
 
 def _antenna(run: Run) -> tuple[AntennaPlace | None, str]:
-    """Return the place of the antenna, or what the positions show instead."""
+    """Return the position of the antenna, or the reason why it is not known."""
     forward, right = known_antenna_m(run)
     if forward is not None and right is not None:
         frames = run.config.frames

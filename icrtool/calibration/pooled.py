@@ -167,7 +167,7 @@ def calibrate_recordings(
     recordings: Sequence[Recording], robot: documents.CalibratedRobot | None = None, findings: tuple[Note, ...] = (),
     grounds: Sequence[str] = (),
 ) -> CalibrationResult:  # fmt: skip
-    """Fit the motion models to all recordings, and test each on what it was not fitted to.
+    """Return the motion models fitted to all recordings, each tested on data that it was not fitted to.
 
     Parameters
     ----------
@@ -326,7 +326,7 @@ SAME_SPEED = 1e-6
 
 
 def calibrate(runs: Run | Sequence[Run] | Mapping[str, Sequence[Run]], *, allow_unusable: bool = False) -> Calibration:
-    """Calibrate the motion model of a robot from one run or many, tested on what it was not fitted to.
+    """Return the motion model of a robot from one run or many, tested on data that it was not fitted to.
 
     Parameters
     ----------
@@ -427,7 +427,7 @@ def _is_part(log: _Taken, longer_log: _Taken) -> bool:
 
 
 def _why_left_out(run: Run, candidate: _Taken, taken: Sequence[_Taken], *, allow_unusable: bool) -> str:
-    """Return why a run is not calibrated with those before it; empty where it is."""
+    """Return why a run is left out of the calibration; empty where it is taken."""
     if not (run.usable or allow_unusable):
         return f"not usable: {run.document.unusable_because}"
     recording = candidate.recording
@@ -444,7 +444,7 @@ def _why_left_out(run: Run, candidate: _Taken, taken: Sequence[_Taken], *, allow
 
 
 def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
-    """Return what a calibration holds of the robot of a run, of track width `width_m`."""
+    """Return the robot of a run, of track width `width_m`, as a calibration states it."""
     robot = run.config.robot
     left, right = (UNSET if error == 1.0 else error for error in run.radius_errors)
     return documents.CalibratedRobot(

@@ -66,13 +66,14 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     recommended : name of the recommended model; `model`, `terms`, `parameters`, `covariance`: that model
     models : every model that was fitted, by name
     gyro : the recommended model with a gyro, None where a log has none
-    logs : what it was fitted to
+    logs : the logs that it was fitted to
     held_out : scores by model, horizon and log, each predicted without that log; of a single log, by block
     held_out_pooled : scores of all these trials together
     geometry, geometry_std : ICRs [m], multiplier and radius factors, from one fit
     controller : numbers for a controller, and their errors where the drive is long enough to measure them
-    error_sources : variances of what the model leaves out, for wheels alone; None where the drive is too short
-    notes : what to know before use; `warnings` : their sentences
+    error_sources : variances of the effects that the model leaves out, for wheels alone; None where the drive is too
+        short
+    notes : findings that matter before use; `warnings` : their sentences
     created : date and time, UTC, ISO 8601
     name : stem of the file that the calibration was read from; the file does not hold this name
 
@@ -118,7 +119,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
 
     @property
     def controller_errors(self) -> documents.ControllerErrors | None:
-        """Errors of what a controller can express; None where the drive is too short to measure them."""
+        """Errors of the controller's model; None where the drive is too short to measure them."""
         errors = {name: one for name, one in msgspec.structs.asdict(self.controller).items() if one is not UNSET}
         return msgspec.convert(errors, documents.ControllerErrors) if "pose_variance" in errors else None
 
@@ -193,7 +194,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m, source)
 
     def prior(self, *, corrected: LogConstants | None = NO_CONSTANTS, heading_source: str | None = None) -> TermsPrior:
-        """Return what the calibration shows of the robot's next drive, as a start for `icrtool.AdaptiveModel`.
+        """Return the prior of the robot's next drive, as a start for `icrtool.AdaptiveModel`.
 
         Parameters
         ----------
@@ -215,7 +216,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         return replace(prior, constants=wheels, turned_constants=turned)
 
     def fitted_to(self, sha256: str) -> bool:
-        """Return whether a log was among those the calibration was fitted to."""
+        """Return whether the calibration was fitted to a log."""
         return bool(sha256) and any(log.sha256 == sha256 for log in self.logs)
 
     def write(self, path: str | Path) -> Path:
@@ -245,7 +246,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         )
 
     def summary(self) -> dict[str, Any]:
-        """Return what the calibration file holds, as plain data."""
+        """Return the content of the calibration file, as plain data."""
         content: dict[str, Any] = plain_value(msgspec.structs.replace(self, name=UNSET))
         return content
 

@@ -132,7 +132,7 @@ class ComparedRow(NamedTuple):
     ----------
     errors_of : its errors in trials, NaN where it has none; path : its path from one state to another, None where it
         has none
-    knows : what its numbers were learned from; empty where `icrtool.records.rows` states it
+    knows : the data that its numbers were learned from; empty where `icrtool.records.rows` states it
     """
 
     name: str
@@ -173,8 +173,8 @@ class ComparedModels(NamedTuple):
     table : held-out table of the run's recording: its trials, blocks of distance, and fits
     track : the run's drive
     heading : kind of the measured heading that rows use, ``gyro`` or ``heading``; empty without one
-    notes : what was left out of the table and why, and what was corrected
-    calibration : what ``icrtool calibrate`` gives for this run alone; None where the track width is not known
+    notes : findings about rows that were left out, and about corrections
+    calibration : the result of ``icrtool calibrate`` for this run alone; None where the track width is not known
     """
 
     rows: tuple[ComparedRow, ...]
@@ -193,7 +193,7 @@ def compare_models(
     *,
     refit_sensors: bool = False,
 ) -> ComparedModels:
-    """Test every model on distance it was not fitted to.
+    """Return every model with its test on distance that it was not fitted to.
 
     Parameters
     ----------
@@ -293,7 +293,7 @@ def models_of(run: Run) -> tuple[Model, ...]:
 
 
 def momentary_knows(run: Run) -> str:
-    """Return what the momentary ICRs of a run were learned from."""
+    """Return in words the data that the momentary ICRs of a run were learned from."""
     start, parts = run.began_with, [PAST]
     if start is not None:
         parts = [f"started from {start.source or 'another run'}", PAST]

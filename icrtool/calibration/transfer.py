@@ -43,7 +43,7 @@ COMPARED = ("y_icr_right_m", "y_icr_left_m", "x_icr_m", "multiplier", "radius_le
 
 
 def compare_groups(groups: Mapping[str, Sequence[Run]]) -> documents.GroupComparison:
-    """Calibrate each group of runs and compare the groups.
+    """Return the comparison of groups of runs by their calibrations.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> documents.GroupCompar
 def compare_calibrations(
     results: Mapping[str, CalibrationResult], recordings: Mapping[str, Sequence[Recording]]
 ) -> documents.GroupComparison:
-    """Compare calibrations of groups of recordings; see `compare_groups`."""
+    """Return the comparison of groups of recordings by their calibrations; see `compare_groups`."""
     tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
     cells, costs = [], []
     for (row, result), (column, own) in product(results.items(), results.items()):
@@ -143,7 +143,7 @@ class _Tested(NamedTuple):
 
 
 def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bool) -> _Tested:
-    """Test a calibration in recordings; with `own`, each trial is predicted by a fit that does not contain it."""
+    """Return the errors of a calibration in recordings; `own`: each trial is predicted by a fit without it."""
     errors, path, before = [], [], 0.0
     for i, one in enumerate(recordings):
         trials = cut_trials(one, TRANSFER_HORIZONS_M)

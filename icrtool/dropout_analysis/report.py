@@ -1,4 +1,4 @@
-"""The dropout report, and what it is compared with: budgets, acceptance limits for CI, an earlier report.
+"""The dropout report, and its comparison with budgets, acceptance limits for CI and an earlier report.
 
 `icrtool.dropout` and `icrtool.dropout_report` return a `DropoutReport`. It is not in `icrtool.records` because it holds
 a calibration, which depends on fits. The code that computes a report is in other modules.
@@ -444,7 +444,7 @@ def start_heading(result: documents.ModelResult, h: int, source: str) -> documen
 
 
 def parse_gate(text: str) -> Gate:
-    """Read a gate.
+    """Return the acceptance limit that a text states.
 
     Raises
     ------
@@ -475,7 +475,7 @@ def parse_gate(text: str) -> Gate:
 def check_gate(
     gate: Gate, report: OpenLoopErrors, baseline: BaselineReport | None = None, *, strict: bool = False
 ) -> Verdict:
-    """Compare a report with an acceptance limit.
+    """Return the verdict of an acceptance limit on a report.
 
     Parameters
     ----------

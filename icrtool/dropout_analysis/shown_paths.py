@@ -184,7 +184,7 @@ def _example(
 
 
 def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple[tuple[int, int], ...]:
-    """Place outages of one length: at given seconds, or spaced over the time in which the robot moves.
+    """Return outages of one length: at given seconds, or spaced over the time in which the robot moves.
 
     Returns
     -------
@@ -215,7 +215,7 @@ def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple
 
 
 def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage, ...]:
-    """Run the filter again without GNSS and heading in the spans, and compare it with the undisturbed run.
+    """Return forced outages: the filter runs again without GNSS and heading in the spans, next to the undisturbed run.
 
     Raises
     ------

@@ -24,7 +24,7 @@ LEAST_FALL = 0.5
 
 
 def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:
-    """Find when each ICR estimate converged, up to a time where one is given.
+    """Return when each ICR estimate converged; `until_s` : the end of the states that are used.
 
     Returns
     -------

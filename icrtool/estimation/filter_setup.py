@@ -95,7 +95,7 @@ class FilterSetup(NamedTuple):
 
 
 def check_start(config: Config) -> None:
-    """Refuse configured initial ICRs on the wrong side, if the preset keeps the sides.
+    """Raise where configured initial ICRs are on the wrong side, if the preset keeps the sides.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def set_up_filter(
     outages_ns: tuple[tuple[int, int], ...] = (),
     start: IcrStart | None = None,
 ) -> FilterSetup:
-    """Prepare a filter run.
+    """Return the arguments of the kernel for a filter run.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def chi2_gate(probability: float, degrees: int) -> float:
 
 
 def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints | slice:
-    """Return the rows outside the outages; without one a slice, which copies nothing."""
+    """Return the rows outside the outages; without outages a slice, to avoid a copy."""
     if not outages_ns:
         return slice(None)
     kept = np.ones(len(stamps_ns), np.bool_)

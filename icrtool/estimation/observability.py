@@ -1,4 +1,4 @@
-"""What a drive shows of the ICRs: its information, what to drive next, and the disagreement of its stretches."""
+"""The information of a drive on its ICRs, the turns that it lacks, and the differences between its stretches."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ LEAST_SLIP = 0.25
 
 @dataclass(frozen=True)
 class StateWindows(Windows):
-    """Displacement and turn over windows of the wheels' distance, linear in what may be unknown.
+    """Displacement and turn over windows of the wheels' distance, linear in the parameters that may be unknown.
 
     Attributes
     ----------
@@ -231,7 +231,7 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
     -----
     The Fisher information of constant ICRs in displacements and heading changes over windows of distance, with the
     filter's own uncertainties and some slip as noise, after the heading's offset and the wheels' scales are
-    marginalised. It is what a drive could show at best, not what the filter learned.
+    marginalised. This information is the most that a drive could show; the filter may have learned less.
     """
     track, width = windows.track, windows.separation_m
     slip = SLIP_SHARE * np.abs([windows.length_m, windows.length_m, windows.turned_rad])

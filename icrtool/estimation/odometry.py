@@ -158,7 +158,7 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
     -----
     The distance is the sum of chords between positions that lie a step apart: longer than their noise, so that a
     parked robot stays where it is. Wheels that turn on the spot do not count. Between the ends of a chord the speed
-    follows the model's, or is constant where the model shows less than half of it.
+    follows the model. It is constant where the model shows less than half of the chord.
     """
     interval, duration = np.diff(table.t_s), float(table.t_s[-1])
     noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m), overwrite_input=True))

@@ -86,7 +86,7 @@ def run_filter(
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
 ) -> Filtered:
-    """Run the filter over the sensors of a log; parameters as in `icrtool.pipeline.fit_log`.
+    """Return the results of the filter over the sensors of a log; parameters as in `icrtool.pipeline.fit_log`.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def run_adaptively(
     Returns parameters and output of the run, and the process noise that it was made with.
 
     The noise is searched for on at most ten minutes of driving; a log without contradiction takes one pass. Preset
-    ``field`` only; what is configured is not searched for.
+    ``field`` only; configured noise is not searched for.
     """
 
     def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterParameters, FilterOutput]:
@@ -375,11 +375,11 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
 
 
 def smooth_run(run: Run) -> States:
-    """Run the RTS smoother over a finished run.
+    """Return the states of a finished run after the RTS smoother.
 
     Parameters
     ----------
-    run : what `icrtool.fit` returned
+    run : result of `icrtool.fit`
 
     Returns
     -------

@@ -245,7 +245,7 @@ def assess_icrs(
     clock_std_s : standard deviation of the time between position and heading; a lag of positions has the same effect as
         an x_icr further back
 
-    In preset ``paper`` the result is the filter's own covariance, and what the drive could show.
+    In preset ``paper`` the covariance is the filter's own, and an ICR counts as shown if the drive could show it.
     """
     table, width = filtered.table, config.robot.track_width_m
     track = track_of_states(table, filtered.in_gap, filtered.outages_ns)

@@ -1,8 +1,8 @@
-"""Gauss-Newton steps with the windows of a drive that have just ended, compiled: what a model learns while it drives.
+"""Compiled Gauss-Newton steps with the windows of a drive that have just ended, for a model that learns as it drives.
 
-Path, residuals and derivatives are those of `icrtool.kernels.window_residuals`; weights and normal equations those of
-`icrtool.kernels.robust` and `icrtool.kernels.elimination`. There are a few dozen windows at a time: in NumPy, its calls
-take most of the time.
+Path, residuals and derivatives are the same as in `icrtool.kernels.window_residuals`, weights and normal equations the
+same as in `icrtool.kernels.robust` and `icrtool.kernels.elimination`. The kernel is compiled because there are only a
+few dozen windows at a time, and calls of NumPy would take most of the time.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class LearnedWindows(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """What is known of q parameters: p terms, the first k of them a model's, and heading offset and delay behind these.
+    """Estimate of q parameters and its information: p terms (the first k are a model's), heading offset, delay.
 
     Attributes
     ----------

@@ -97,7 +97,7 @@ SHARED_OF_WHEELS, SHARED_OF_TURNED = (
 
 @dataclass(frozen=True)
 class TermsPrior:
-    """What is known of a robot before a drive: mean and covariance of the terms of model `RECOMMENDED`.
+    """The prior of a robot before a drive: mean and covariance of the terms of model `RECOMMENDED`.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class TermsPrior:
 
 
 class Learned(NamedTuple):
-    """What is known from one time of a drive on.
+    """The model and constants that are known from one time of a drive on.
 
     Attributes
     ----------
@@ -274,7 +274,7 @@ class AdaptiveModel:
 
     @property
     def now(self) -> Learned:
-        """What is known now."""
+        """The model and constants that are known now."""
         wheels, turned = self._wheels, self._turned
         time_s = self._last[0] if self._last is not None else 0.0
         if turned is None:

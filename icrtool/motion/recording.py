@@ -146,7 +146,7 @@ def size_of(width_m: float) -> float:
 def cut_windows(
     recording: Recording, lengths_m: Sequence[float] | None = None, pooled: Totals | None = None
 ) -> Windows:
-    """Cut a recording into windows of driven distance, ready to be fitted: the wheel samples of their track are joined.
+    """Return the windows of driven distance of a recording for a fit; the wheel samples of their track are joined.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is known of a skid-steer robot before it drives: the spread of the robots that logs and publications show."""
+"""The prior of a skid-steer robot before it drives, from the spread of robots in logs and publications."""
 
 from __future__ import annotations
 
