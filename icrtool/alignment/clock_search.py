@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from icrtool.alignment.log_track import IMPOSSIBLE_M
+from icrtool.alignment.wheel_units import FASTER
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Floats, Ints, trapezoids, unwrapped
 from icrtool.records.measurements import Finding
@@ -204,6 +205,9 @@ class _Rates(NamedTuple):
             return cls(None, None)
         velocity = _rate(gnss.stamp_ns, gnss.north_m, log) + 1j * _rate(gnss.stamp_ns, gnss.east_m, log)
         speed, known = np.abs(velocity), _known(gnss.stamp_ns, log)
+        # a jump of the positions has no speed, and would outweigh all others
+        jumps = speed > FASTER * max(float(np.abs(side).max()) for side in (log.wheels.left, log.wheels.right))
+        known, velocity = known & ~jumps, np.where(jumps, np.nan, velocity)
         # a robot on the spot has no course over ground
         step = max(round(SPEED_OVER_S / GRID_S), 1)
         turned = np.angle(velocity[step:] * np.conj(velocity[:-step])) / SPEED_OVER_S

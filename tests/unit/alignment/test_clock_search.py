@@ -102,6 +102,16 @@ def test_clocks_that_agree_are_left_alone() -> None:
     assert "clock_shifted" not in check(run)
 
 
+@pytest.mark.parametrize("row", [-1, 700])
+@pytest.mark.parametrize("shift_s", [0.0, 18.0])
+def test_a_fix_that_jumps_shows_no_shift(row: int, shift_s: float) -> None:
+    log = later(make_log(seconds=120.0), gnss=shift_s)
+    north = log.gnss.north_m.copy()
+    north[row] += 55_000.0
+    found = take_shifts(replace(log, gnss=replace(log.gnss, north_m=north)), load_config(sets=SETS))[2]
+    assert found.gnss == pytest.approx(shift_s, abs=0.2)
+
+
 def test_a_drive_that_repeats_itself_shows_no_shift() -> None:
     log = make_log(seconds=120.0)
     t = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
