@@ -54,7 +54,7 @@ NO_NAME = OffsetName("", None, None)
 
 
 def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_ns: int) -> OffsetName:
-    """Name an offset of a heading clockwise from north.
+    """Return the possible cause of the offset of a heading, clockwise from north.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ NOT_COMPARED = CourseComparison(0, math.nan, math.nan, False, 0.0)
 
 
 def compare_with_course(windows: DriveWindows) -> CourseComparison:
-    """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
+    """Return the comparison of heading and course over ground of a drive, in windows that hardly overlap."""
     track, apart = windows.track, slice(None, None, STARTS_A_WINDOW)
     seen, laid, third_m = windows.seen[apart], windows.laid[apart], windows.length_m[apart] / 3
     gone, lasted_s = windows.over(track.at_places(track.mean_speed))[apart], windows.over(track.place_t)[apart]

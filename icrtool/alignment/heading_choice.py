@@ -138,7 +138,7 @@ class DerivedHeading:
 
 
 def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
-    """Estimate the heading of a log without one, from its best sources.
+    """Return the estimated heading of a log without a heading, from its best sources.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
 
 
 def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
-    """Estimate the heading from gyro, course over ground and the heading that the log states.
+    """Return the heading estimated from gyro, course over ground and the heading that the log states.
 
     None without a gyro, with a dead gyro, where the stated heading alone is equally good, and where the stated heading
     comes from the position reference.

@@ -173,7 +173,7 @@ def windows_of_log(log: RobotLog, width_m: float, heading: HeadingSamples | None
 
 
 def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, length_m: float = 0.0) -> DriveWindows:
-    """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
+    """Return overlapping windows of a drive: of wheel distance between fixes, and of time between headings.
 
     The length of the arrays depends on the number of samples and not on the speeds, so that a damaged speed needs no
     more memory.
@@ -241,7 +241,7 @@ def chord_s(track: Track) -> float:
 
 
 def cut_chords(track: Track) -> tuple[Floats, Complexes, Floats, Floats]:
-    """Cut a drive into spans of `chord_s` from fix to fix, without a heading.
+    """Return spans of `chord_s` of a drive from fix to fix, without a heading.
 
     Returns
     -------

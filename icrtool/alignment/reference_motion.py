@@ -162,7 +162,7 @@ class ComparedWindows(NamedTuple):
 
 
 def lay_knots(sensors: SensorData) -> Knots | None:
-    """Integrate the wheels to the times of the fixes; None where the streams share too little time."""
+    """Return the motion of the wheels at the times of the fixes; None where the streams share too little time."""
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
     if min(len(wheels.stamp_ns), len(fixes.stamp_ns), len(headings.stamp_ns)) < FEWEST_FIXES:
         return None
@@ -258,7 +258,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
 
 
 def compare_with_wheels(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: float) -> ComparedWindows:
-    """Compare reference and wheels between rows of the knots (w,).
+    """Return the motion of the reference minus the wheels' between rows of the knots (w,).
 
     Parameters
     ----------

@@ -130,7 +130,7 @@ class Courses(NamedTuple):
 
 
 def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
-    """Cut the drive into windows of distance that follow one another, and measure the course over ground in each."""
+    """Return the course over ground of a drive in each of the windows of distance that follow one another."""
     corrected = trapezoids(turn.t, turn.rate - guess.bias)
     v, u = track.mean_speed, track.half_difference
     middle = track.t + track.held / 2
@@ -210,7 +210,7 @@ def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
 
 
 def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Floats, Complexes, Ints, Ints]:
-    """Cut a span of a drive into windows of driven distance that follow one another, and share no fix.
+    """Return windows of driven distance of a span of a drive; they follow one another and share no fix.
 
     Returns
     -------

@@ -186,7 +186,7 @@ def contradictions(row: str, sensors: documents.HeldSensors, among: Iterable[str
                 f"holds {constant_text(sensors.held, name)} and this log shows {constant_text(sensors.measured, name)}"
             )
             why = f"{words}: the calibration {both}, {abs(apart) / std:.1f} σ apart"
-            what = "its errors hold this difference; --refit-sensors takes the constants of this log"
+            what = "the errors of its rows include this difference; --refit-sensors takes the constants of this log"
             advice = "calibrate again if a sensor was moved or a clock has changed"
             notes.append(note(SENSORS_CONTRADICT, f"row {row}: {why}: {what}; {advice}"))
     return notes

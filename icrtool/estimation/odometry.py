@@ -71,7 +71,7 @@ def odometry_icrs(table: States, track_width_m: float | None) -> dict[OdometryNa
 
 
 def drive_wheels(table: States, in_gap: Bools, icrs: FrozenIcrs, every: int = 1) -> OdometryPath:
-    """Drive from the first state to the last; through a gap in the wheel data move as the filter did.
+    """Return the path of the wheels from the first state to the last; in a gap of the wheel data it follows the filter.
 
     Parameters
     ----------

@@ -193,7 +193,7 @@ MOST_SEARCHED_SAMPLES = 60_000
 def run_adaptively(
     sensors: SensorData, config: Config, warm_start: WarmStart | None, changes_s: tuple[float, ...]
 ) -> tuple[FilterParameters, FilterOutput, ProcessNoise]:
-    """Run the filter; where fixes or headings contradict the wheels, with the process noise that they show.
+    """Run the filter, with more process noise where fixes or headings contradict the wheels.
 
     Returns parameters and output of the run, and the process noise that it was made with.
 

@@ -78,7 +78,7 @@ class _Arguments:
 
     Attributes
     ----------
-    types : what the machine code depends on, one for each array, tuple and number
+    types : types that the machine code depends on, one for each array, tuple and number
     words, forms : the values in order, tuples unpacked, and their C types
     """
 
@@ -318,7 +318,8 @@ def _clear(sums: np.ndarray[Any, Any]) -> None:
 def passes_as_expected() -> bool:
     """Return whether machine code of this numba takes and returns values as `Kernel` expects.
 
-    Two small kernels must give what Python gives. It takes 0.3 s of CPU, once in a process that compiles.
+    Two small kernels must give the same results as Python. The check takes 0.3 s of CPU, once in a process that
+    compiles.
     """
     try:
         _numba()
@@ -431,7 +432,7 @@ def processor() -> tuple[str, str]:
 
 @functools.cache
 def _stamp() -> tuple[str, ...]:
-    """Return what machine code depends on: the sources of all kernels, compiler, target and processor.
+    """Return the texts that machine code depends on: sources of all kernels, compiler, target and processor.
 
     The sources of all kernels count, because the machine code of a kernel holds the kernels that it calls.
 

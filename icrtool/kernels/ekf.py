@@ -2,7 +2,7 @@
 
 The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
 `filter_events` is the one event loop: the filter and the smoother's forward pass call it. The tests compare the filter
-with a filter in matrix form (tests/support/matrix_filter.py), which is the one to read first.
+with a filter in matrix form (tests/support/matrix_filter.py), which is easier to read first.
 
 The smoother runs the filter again and keeps a node for every event: the predicted state, and the state after the
 updates. Backwards, with F of Eqs. 17, 27-29 between node i and the next,
@@ -340,7 +340,7 @@ def run_ekf(
 
 
 def compiled_inputs(data: FilterInputs) -> FilterInputs:
-    """Return the inputs in the one form that the kernel is compiled for; copies only what is not in it."""
+    """Return the inputs in the one form that the kernel is compiled for; only inputs in another form are copied."""
     return FilterInputs._make(np.require(column, requirements=["C", "A", "W"]) for column in data)
 
 

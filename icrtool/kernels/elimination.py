@@ -1,4 +1,4 @@
-"""Normal equations of parameters that all parts of the data share, with those that each part has for itself eliminated.
+"""Normal equations of parameters that all parts of the data share, after elimination of each part's own parameters.
 
 A part's own parameters occur in no residual of another part. Its own normal equations give them for any values of the
 shared ones (a Schur complement), so time and memory grow with the number of parts, not with its cube.

@@ -240,7 +240,7 @@ def error_intervals(
     ----------
     errors_m, blocks : as given to `block_sums`, which returned `sums`
     p50_m, p95_m : of all trials
-    spread : what is known of other drives
+    spread : spread between drives, known from other drives
 
     Returns
     -------
@@ -398,7 +398,7 @@ class RankedTrials(NamedTuple):
         return len(self.errors_m), float(self.errors_m.mean()), p50, p95, float(self.errors_m.max())
 
     def histogram(self, bin_width_m: float) -> Histogram:
-        """Count the trials in bins of `bin_width_m` [m] from zero to the largest error (Figs. 28-30)."""
+        """Return the trials in bins of `bin_width_m` [m] from zero to the largest error (Figs. 28-30)."""
         _, counts = count_cells(self.errors_m, bin_width_m)
         edges = bin_width_m * np.arange(len(counts) + 1, dtype=np.float64)
         return Histogram(edges[:-1], edges[1:], 100.0 * counts / max(len(self.errors_m), 1))

@@ -13,7 +13,7 @@ Codes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
-"""What was done with a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
+"""Outcome of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
 
 GUARDED, UNGUARDED, PRINTED = 0, 1, 2
 """Sign guards (Section 5.1): Eqs. 32-34 with their derivatives; Eqs. 8-10; Eqs. 32-34 with derivatives as printed.
@@ -98,10 +98,10 @@ class FilterOutput(NamedTuple):
     Attributes
     ----------
     states : (13, k) x, diagonal of P, path length [m], after all updates at the stamps of the last k wheel samples
-    gnss_code : (m,) what was done with each fix: `UNSEEN`, `USED`, `GATED` or `RECOVERED`
+    gnss_code : (m,) outcome of each fix: `UNSEEN`, `USED`, `GATED` or `RECOVERED`
     gnss_nis : (m,) normalised innovation squared; gnss_det : (m,) determinant of S [m^4]; both NaN where unseen
     gnss_residual : (m, 2) fix minus estimate after the update, north and east [m]
-    heading_code, heading_nis, heading_innovation : (h,) likewise; the last is before the update [rad]
+    heading_code, heading_nis : (h,) the same of each heading; heading_innovation : (h,) before the update [rad]
     P : (6, 6) covariance at the end
     P_at_stops : (s, 6, 6) covariance at the requested rows
     """
@@ -197,7 +197,7 @@ class Nodes(NamedTuple):
     ----------
     x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 6, 6) likewise
     G : (m, 3, 4) of `step_jacobian` for the step from the node before; 0 where the pose is not dead-reckoned
-    row : int64 (m,), wheel sample recorded here, -1 where none is
+    row : int64 (m,), wheel sample recorded here, -1 without one
     """
 
     x_predicted: Floats

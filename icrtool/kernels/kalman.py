@@ -63,7 +63,7 @@ def correct(x: Floats, P: Floats, Ph: Floats, S: float, nu: float, fixed: Bools 
 
 @njit_part
 def store(x: Floats, P: Floats, states: Floats, covariances: Floats, i: int) -> None:
-    """Keep a state and its covariance in row i of states (n, k) and covariances (n, k, k)."""
+    """Store a state and its covariance in row i of states (n, k) and covariances (n, k, k)."""
     # Element by element: numba takes seconds to compile the assignment of an array to a row of a larger one.
     for a in range(len(x)):
         states[i, a] = x[a]

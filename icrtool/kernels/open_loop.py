@@ -85,7 +85,7 @@ def integrate_trials(
 
 
 def compiled_columns(track: Track) -> Columns:
-    """Return the columns of a track in the one form the kernels are compiled for; copies only what is not in it.
+    """Return the columns of a track in the one form that kernels are compiled for; only other forms are copied.
 
     Notes
     -----
@@ -102,7 +102,7 @@ def compiled_icrs(icrs: FrozenIcrs) -> FrozenIcrs:
 
 
 def open_loop_errors_direct(track: Track, icrs: FrozenIcrs, ends: Rows, lo: int = 0) -> Floats:
-    """Integrate every trajectory step by step: O(starts x steps), the oracle.
+    """Return the errors of trials that are integrated step by step: O(starts x steps), the oracle.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def open_loop_errors_direct(track: Track, icrs: FrozenIcrs, ends: Rows, lo: int 
 def open_loop_path(
     track: Track, y_icr_right: float, y_icr_left: float, x_icr: float, start: int, end: int
 ) -> OpenLoopPath:
-    """Drive open loop from state `start` to state `end` with constant ICRs [m].
+    """Return the open-loop path from state `start` to state `end` with constant ICRs [m].
 
     Returns
     -------
@@ -232,7 +232,7 @@ def wheel_steps(columns: Columns, first: int, last: int, turn: float) -> Iterato
 
 
 def plan_block(columns: Columns, icrs: FrozenIcrs, last: int, starts: slice) -> BlockPlan:
-    """Choose the moments for some starts and their `icrs`, whose trials end at state `last` at the latest.
+    """Return the moments to use for some starts and their `icrs`; their trials end at state `last` or before.
 
     Notes
     -----
@@ -374,7 +374,7 @@ def solve_block(
 
 
 def open_loop_errors(track: Track, icrs: FrozenIcrs, ends: Rows, lo: int = 0) -> Floats:
-    """Return what `open_loop_errors_direct` returns, equal to 1e-9 m, in far less time."""
+    """Return the errors of `open_loop_errors_direct`, equal to 1e-9 m, in far less time."""
     by_horizon = np.ascontiguousarray(ends.T)
     errors = np.empty(by_horizon.shape)
     fill_open_loop_errors(track, icrs, by_horizon, errors, 0, len(ends), lo)

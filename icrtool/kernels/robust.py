@@ -146,7 +146,7 @@ def robust_least_squares(
     most_steps: int = 15,
     settled: float = LAST_STEP_SIGMAS,
 ) -> RobustFit:
-    """Minimise a soft-L1 loss of residuals under a normal prior by Gauss-Newton steps.
+    """Return the minimum of a soft-L1 loss of residuals under a normal prior, by Gauss-Newton steps.
 
     Parameters
     ----------

@@ -222,7 +222,7 @@ class Windows:
 
 
 def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Windows:
-    """Cut a drive into windows of driven distance; none crosses a gap, a jump or a slip event, or ends in an outage.
+    """Return windows of driven distance of a drive; no window crosses a gap, jump or slip event, or ends in an outage.
 
     Parameters
     ----------

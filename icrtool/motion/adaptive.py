@@ -1,9 +1,9 @@
 """A motion model that learns from the past of a drive, sample by sample: on board, and as row ``adaptive`` of a report.
 
-It begins with a prior: a calibration, or what is known of robots. Each window of driven distance that has ended adds to
-the normal equations, with the terms, residuals, weights and priors of `icrtool.motion.window_fit`. Gauss-Newton steps
-give the next solution. On the first `REBUILT_TO_M` of a drive the normal equations are also computed anew from time to
-time, because the first windows were linearised far from the later solution.
+The model begins with a prior from a calibration or from other robots. Each window of driven distance that has ended
+adds to the normal equations, with the terms, residuals, weights and priors of `icrtool.motion.window_fit`. Gauss-Newton
+steps give the next solution. On the first `REBUILT_TO_M` of a drive the normal equations are also computed anew from
+time to time, because the first windows were linearised far from the later solution.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class TermsPrior:
     mean, covariance : (8,), (8, 8)
     turned_mean, turned_covariance : of the terms of the model with a gyro (6,), (6, 6)
     source : origin of the prior, in a few words
-    constants, turned_constants : what is known of the drive's constants, with wheels alone and with a gyro
+    constants, turned_constants : prior of the drive's constants, with wheels alone and with a gyro
     """
 
     width_m: float
@@ -316,7 +316,7 @@ class AdaptiveModel:
         return bool(self._take(samples))
 
     def observe_all(self, samples: Floats) -> list[Learned]:
-        """Take many samples (10, n) at once, in rows `icrtool.motion.drive_buffer.SampleRow`; return what was learned.
+        """Take many samples (10, n), in rows `icrtool.motion.drive_buffer.SampleRow`; return the learned models.
 
         Notes
         -----

@@ -128,7 +128,7 @@ class MotionModel:
         return np.array(self.stds or [TERMS[name].std for name in self.terms])
 
     def widened(self) -> MotionModel | None:
-        """Return the model with the wide prior of each term that has one; None where none has."""
+        """Return the model with the wide prior of each term that has a wide prior; None without such a term."""
         if self.stds or not any(TERMS[name].wide for name in self.terms):
             return None
         return replace(self, stds=tuple(TERMS[name].wide or TERMS[name].std for name in self.terms))

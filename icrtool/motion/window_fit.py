@@ -399,7 +399,7 @@ def own_constants(
 
     Parameters
     ----------
-    held : constants that keep their values; those that are NaN are estimated. Default: all are
+    held : constants that keep their values; constants that are NaN are estimated. Default: all are estimated
     """
     held_values = np.full(len(constant_std(fitted.model)), np.nan)
     if held is not None:
@@ -428,7 +428,7 @@ def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) ->
 def _fit_constants(
     windows: Windows, fitted: FittedModel, width_m: float, known: Floats, overlap: float
 ) -> tuple[Floats, RobustFit]:
-    """Return all constants (c,), and the fit of those that are NaN in `known` (c,)."""
+    """Return all constants (c,), and the fit of the constants that are NaN in `known` (c,)."""
     of_both, free = residuals_of(windows, fitted.model, width_m, fitted.wheels), np.isnan(known)
     std = constant_std(fitted.model)[free]
 
@@ -498,7 +498,7 @@ class Pool:
         return np.asarray(apart | (self.recording != fold.recording), np.bool_)
 
     def fit(self, model: MotionModel, wheels: PooledFit | None = None) -> PooledFit:
-        """Fit a model.
+        """Return the fit of a model to the windows.
 
         Parameters
         ----------

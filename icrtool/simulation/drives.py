@@ -1,4 +1,4 @@
-"""Simulate a robot on a path, the sensors of Pentzer 2014, Section 4, and their recording."""
+"""Simulated drives: a robot on a path, the sensors of Pentzer 2014, Section 4, and their recording."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ class Readings:
 
 
 def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
-    """Refuse a plan that cannot be driven, or sensors that give too few samples.
+    """Raise where a plan cannot be driven, or where sensors give too few samples.
 
     Raises
     ------
@@ -383,7 +383,7 @@ def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorColumn
 
 
 def record_drive(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> SensorColumns:
-    """Stamp readings from `START_NS` on, delays included, and put the fixes on the globe about `DATUM`."""
+    """Return readings with stamps from `START_NS` on, delays included, and with geodetic fixes about `DATUM`."""
     from pymap3d import ned2geodetic
 
     fixes = len(readings.gnss_t)

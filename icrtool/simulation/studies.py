@@ -116,7 +116,7 @@ def on_circle(base: Scenario, radius: float) -> Scenario:
 
 
 def by_start(request: StudyRequest) -> Iterator[Setting]:
-    """Vary the guard and, on a grid, both initial y ICRs."""
+    """Yield a setting for each guard and, on a grid, for each pair of initial y ICRs."""
     base, initial_x_m = in_preset(request, request.presets[0]), request.config.filter.initial_x_icr_m
     of_preset = base.config.filter.rules.initial_icrs_m or (0.0, 0.0, 0.0)
     x = initial_x_m if initial_x_m is not None else of_preset[2]
@@ -128,7 +128,7 @@ def by_start(request: StudyRequest) -> Iterator[Setting]:
 
 
 def by_case(request: StudyRequest) -> Iterator[Setting]:
-    """Draw the truth from the filter's own model, or drive exact kinematics with each preset.
+    """Yield a setting with a truth drawn from the filter's own model, and one with exact kinematics for each preset.
 
     Notes
     -----

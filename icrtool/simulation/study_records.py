@@ -116,7 +116,7 @@ def chi2_band(degrees: int, runs: int) -> tuple[float, float]:
 
 
 def consistency_of(found: Mapping[str, Floats]) -> dict[str, Any]:
-    """Return what `measure_consistency` shows of a case: means with their 95 % bands, coverage and rms by state."""
+    """Return the numbers of `measure_consistency`: means with their 95 % bands, coverage and rms by state."""
     nees, ratio, runs = found["settled nees"], found["ratio"], len(found["nees"])
     low, high = chi2_band(6 * runs, runs)
     by_stop = nees.mean(axis=0)

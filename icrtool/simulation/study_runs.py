@@ -117,7 +117,7 @@ Measure = Callable[[StudyRun], Found]
 def run_scenarios(
     scenarios: Sequence[Scenario], runs: int, seed: int, measures: Sequence[Measure], progress: Progress | None = None
 ) -> list[dict[str, Floats]]:
-    """Simulate and filter every scenario `runs` times, on all cores (the kernels free the GIL).
+    """Return the results of `runs` filtered simulations of every scenario, on all cores (the kernels free the GIL).
 
     Parameters
     ----------
