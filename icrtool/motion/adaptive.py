@@ -17,24 +17,13 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.elimination import normal_equations
-from icrtool.kernels.learning import Belief, LearnedWindows, learn, prepare
 from icrtool.kernels.robust import robust_weights, scale_by_kind
 from icrtool.kernels.track import Windows
 from icrtool.kernels.window_residuals import OMEGA
 from icrtool.motion.drive_buffer import LARGEST_ADVANCE_M, DriveBuffer
-from icrtool.motion.models import (
-    GYRO_TERMS,
-    MODELS,
-    RECOMMENDED,
-    TERMS,
-    FittedModel,
-    MotionModel,
-    WheelMotion,
-    wheel_motion,
-)
+from icrtool.motion.models import GYRO_TERMS, MODELS, RECOMMENDED, TERMS, FittedModel, MotionModel, wheel_motion
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, size_of
 from icrtool.motion.window_fit import (
-    CONSTANTS_OF_WHEELS,
     RESIDUAL_KINDS,
     UNKNOWN_CONSTANTS,
     KnownConstants,
@@ -42,7 +31,6 @@ from icrtool.motion.window_fit import (
     constant_std,
     heading_wander,
     residuals_of,
-    step_columns,
 )
 
 WINDOWS_AS_ONE = 80.0
@@ -178,44 +166,40 @@ class Estimate:
         kind = np.repeat(RESIDUAL_KINDS, len(windows.begin))
         few = len(windows.begin) < FEWEST_FOR_WANDER
         evaluate = residuals_of(windows, self.model, self.width_m, wheels, 0.0 if few else None)
-        at, (residuals, jacobian) = self.x, self._evaluated(evaluate)
+        residuals, target, jacobian = self._linearised(evaluate)
         for step in range(GAUSS_NEWTON_STEPS):
             if step:
-                at, (residuals, jacobian) = self.x, self._evaluated(evaluate)
+                residuals, target, jacobian = self._linearised(evaluate)
             self.scale = _scale_of(residuals, kind)
-            self._step(*self._equations(residuals, jacobian, kind, at))
-        self.matrix, self.vector = self._equations(residuals, jacobian, kind, at)
+            self._step(*self._equations(target, jacobian, kind))
+        self.matrix, self.vector = self._equations(target, jacobian, kind)
         if not few:
-            turns = (residuals + jacobian @ (self.x - at))[kind == RESIDUAL_KINDS[-1]]
+            turns = (jacobian @ self.x - target)[kind == RESIDUAL_KINDS[-1]]
             self.wander = heading_wander(turns * np.sqrt(windows.length_m), windows.length_m)
         self._finish(wheels)
 
-    def solve_with(self, windows: Windows, motion: WheelMotion, wheels: FittedModel | None = None) -> None:
-        """Solve with some further windows, linearised at the last solution; `motion` of the windows' wheel samples."""
-        steps, k = windows.track, len(self.model.terms)
-        offset, delay = self.x[k : k + CONSTANTS_OF_WHEELS].tolist()
-        columns = step_columns(steps, motion, self.model, wheels)(self.x[:k], self.x[k:])
-        added = LearnedWindows(
-            steps.t, steps.held, steps.into, *columns, steps.place_t + delay, windows.begin, windows.end,
-            windows.moved, windows.turned, windows.length_m, offset, self.wander,
-        )  # fmt: skip
-        belief = Belief(
-            self.x, self.prior, self.pull, self.matrix, self.vector, self.scale, WINDOWS_AS_ONE,
-            LARGEST_DELAY_S,
-        )  # fmt: skip
-        found = learn(added, belief, k, GAUSS_NEWTON_STEPS)
-        self.x, self.matrix, self.vector = found.x, found.matrix, found.vector
+    def solve_with(self, windows: Windows, wheels: FittedModel | None = None) -> None:
+        """Solve with some further windows, linearised at the last solution; `wheels` as in `residuals_of`."""
+        kind = np.repeat(RESIDUAL_KINDS, len(windows.begin))
+        evaluate = residuals_of(windows, self.model, self.width_m, wheels, self.wander)
+        _, target, jacobian = self._linearised(evaluate)
+        for _ in range(GAUSS_NEWTON_STEPS):
+            matrix, vector = self._equations(target, jacobian, kind)
+            self._step(self.matrix + matrix, self.vector + vector)
+        matrix, vector = self._equations(target, jacobian, kind)
+        self.matrix, self.vector = self.matrix + matrix, self.vector + vector
         self._finish(wheels)
 
-    def _evaluated(self, evaluate: Residuals) -> tuple[Floats, Floats]:
+    def _linearised(self, evaluate: Residuals) -> tuple[Floats, Floats, Floats]:
+        """Return residuals (m,) at `x`, and target (m,) and J (m, k + c) of the residuals near it, J x - target."""
         k = len(self.model.terms)
-        return evaluate(self.x[:k], self.x[k:])
+        residuals, jacobian = evaluate(self.x[:k], self.x[k:])
+        return residuals, jacobian @ self.x - residuals, jacobian
 
-    def _equations(self, residuals: Floats, jacobian: Floats, kind: Ints, at: Floats) -> tuple[Floats, Floats]:
-        """Return matrix and vector of residuals (m,) that were linearised at some parameters, weighted at `x`."""
-        here = residuals + jacobian @ (self.x - at)
-        weights = robust_weights(here, self.scale[kind], WINDOWS_AS_ONE)
-        return normal_equations(jacobian @ at - residuals, jacobian, weights)
+    def _equations(self, target: Floats, jacobian: Floats, kind: Ints) -> tuple[Floats, Floats]:
+        """Return matrix and vector of the normal equations of linearised residuals, weighted at `x`."""
+        weights = robust_weights(jacobian @ self.x - target, self.scale[kind], WINDOWS_AS_ONE)
+        return normal_equations(target, jacobian, weights)
 
     def _step(self, matrix: Floats, vector: Floats) -> None:
         x = np.linalg.solve(self.prior + matrix, self.pull + vector)
@@ -242,8 +226,8 @@ def _scale_of(residuals: Floats, kind: Ints) -> Floats:
 class AdaptiveModel:
     """A motion model that starts from a prior and learns from the samples of a drive as they come.
 
-    Frames and signs follow `icrtool`: x forward, y right, turns clockwise. It holds some kilobytes and opens no log.
-    The first model on a computer compiles a kernel, which takes seconds; later processes load it.
+    Frames and signs follow `icrtool`: x forward, y right, turns clockwise. The model is plain NumPy, holds some
+    kilobytes, and opens no file or log.
 
     Parameters
     ----------
@@ -256,7 +240,6 @@ class AdaptiveModel:
     """
 
     def __init__(self, prior: TermsPrior, *, with_gyro: bool = False) -> None:
-        prepare()
         self.prior, self.with_gyro, self.distance_m = prior, with_gyro, 0.0
         size = size_of(prior.width_m)
         self._drive, self._longest_m = DriveBuffer(size), LARGEST_ADVANCE_M * size
@@ -371,14 +354,10 @@ class AdaptiveModel:
         if anew := self._next_anew_m <= at_m <= REBUILT_TO_M * self._drive.size:
             self._next_anew_m = (1.0 + REBUILT_SHARE) * at_m
             windows = self._drive.windows(0, last, knot) or windows
-        steps, wheels = windows.track, None
-        motion = wheel_motion(steps.v_left, steps.v_right, self.prior.width_m, steps.gyro)
+        wheels: FittedModel | None = None
         for one in (self._wheels, self._turned):
-            if one is None:
-                continue
-            if anew:
-                one.solve_anew(windows, wheels)
-            else:
-                one.solve_with(windows, motion, wheels)
-            wheels = one.fitted
+            if one is not None:
+                solve = one.solve_anew if anew else one.solve_with
+                solve(windows, wheels)
+                wheels = one.fitted
         return True
