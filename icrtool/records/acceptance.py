@@ -1,4 +1,4 @@
-"""What a dropout report is asked for, and its answers: distances within a budget, and verdicts on acceptance limits."""
+"""Answers of a dropout report: distances with errors within a budget, and verdicts on acceptance limits."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ NEAR_HORIZONS_M = 1.5
 
 
 class BudgetDistance(Record, frozen=True):
-    """How far a model's 95th percentile stays within a budget.
+    """Distance [m] over which the 95th percentile of a model's errors stays within a budget [m].
 
     Attributes
     ----------
-    distance_m : interpolated between horizons, from 0 m at 0 m
+    distance_m : interpolated between horizons; the error is 0 m at a distance of 0 m
     beyond : `distance_m` is a lower bound: the error is within the budget at the last horizon with trials
     between_m : the two horizons between which `distance_m` was interpolated
-    without_events_m, beyond_without_events : distance_m and beyond of trials that touch no slip event; None without an
-        event
+    without_events_m, beyond_without_events : `distance_m` and `beyond` of the trials that touch no slip event; None and
+        False where the drive has no slip event
     low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; None where
         they stay within it, and where there is no interval
     next_low_m, next_high_m : these distances for the next drive of this robot on this kind of ground, in 9 of 10 cases
@@ -66,7 +66,7 @@ class BudgetDistance(Record, frozen=True):
 
     @property
     def other_text(self) -> str:
-        """As `next_text`, on another ground; empty where nothing is known of it."""
+        """Distance range of the next drive on another ground, formatted as `next_text`; empty where it is not known."""
         if self.other_low_m is UNSET or self.other_high_m is UNSET:
             return ""
         if self.other_low_m is None:
@@ -76,18 +76,18 @@ class BudgetDistance(Record, frozen=True):
 
     @property
     def short_text(self) -> str:
-        """``14.1 m``, ``about 14 m`` or ``less than 1 m`` between far horizons, or ``more than 20 m``."""
+        """Distance as ``14.1 m`` or ``more than 20 m``; between far horizons ``about 14 m`` or ``less than 1 m``."""
         if self.beyond:
             return f"more than {self.distance_m:g} m"
         low, high = self.between_m
         if high - low <= NEAR_HORIZONS_M:
             return f"{self.distance_m:.1f} m"
-        # The error grows faster than the distance: on a straight line between far horizons it comes out too long.
+        # The error grows faster than the distance: linear interpolation between far horizons gives too long a distance.
         return f"about {self.distance_m:.0f} m" if self.distance_m >= 1.0 else "less than 1 m"
 
     @property
     def without_events_text(self) -> str:
-        """As `short_text`, of the trials that touch no slip event; empty where there is none."""
+        """Distance of the trials that touch no slip event, as ``14.1 m``; empty where the drive has no slip event."""
         if self.without_events_m is None:
             return ""
         return (
@@ -96,14 +96,14 @@ class BudgetDistance(Record, frozen=True):
 
     @property
     def to_plan_with_m(self) -> float | None:
-        """The distance that the next drive keeps in 9 of 10 cases [m]; None where nothing is expected of it."""
+        """Distance [m] over which 9 of 10 next drives stay within the budget; None where it is not known."""
         if self.next_low_m is None:
             return self.distance_m if self.beyond else None
         return self.next_low_m
 
     @property
     def next_text(self) -> str:
-        """``5.1-18 m``, ``5.1 m or more``, or empty where nothing is expected of the next drive."""
+        """Distance range of the next drive as ``5.1-18 m`` or ``5.1 m or more``; empty where it is not known."""
         if self.next_low_m is None:
             # Even the upper end stays within the budget at the last horizon.
             return f"more than {self.distance_m:g} m" if self.beyond else ""
@@ -116,10 +116,10 @@ class Gate(Record, frozen=True):
 
     Attributes
     ----------
-    horizon_m : distance at which an error is bounded; None of a limit on the distance itself
-    budget_m : of ``recommended.within@0.5m >= 10``, the error within which the distance counts; else None
-    bound_m : [m] the bound, without the share of the baseline
-    baseline_factor : what the baseline's number is multiplied with; 0 where the limit does not name the baseline
+    horizon_m : distance at which an error is bounded [m]; None for a limit on a distance
+    budget_m : largest error of a limit on a distance [m]: 0.5 in ``recommended.within@0.5m >= 10``; else None
+    bound_m : the constant part of the bound [m], without the part that depends on the baseline
+    baseline_factor : factor on the baseline's number; 0 where the limit does not name the baseline
     """
 
     text: str
@@ -133,25 +133,25 @@ class Gate(Record, frozen=True):
 
     @property
     def relative(self) -> bool:
-        """Whether it names the baseline."""
+        """Whether the limit names the baseline."""
         return bool(self.baseline_factor)
 
 
 class Verdict(Gate, frozen=True, kw_only=True):
-    """Whether an acceptance limit was kept; numbers are None where there is none.
+    """Whether a log meets an acceptance limit; a number is None where it is not known.
 
     Attributes
     ----------
-    value_m : None where the log has no trial of that length
-    baseline_m : the baseline's number
-    margin_m : negative where the number exceeds the bound; margin_low_m, margin_high_m : its 95 % confidence interval,
-        of a limit relative to the baseline
+    value_m : the log's number [m]; None where the log has no trial of that length
+    baseline_m : the baseline's number [m]
+    margin_m : distance of the number from the bound [m]; negative where the number violates the bound
+    margin_low_m, margin_high_m : 95 % confidence interval of the margin [m], for a limit relative to the baseline
     passed : the limit is met; a limit relative to the baseline is also met where the interval of the difference reaches
         the bound
-    value_bound_m : the bound, with the baseline's share
+    value_bound_m : the bound [m], with the part that depends on the baseline
     not_checked : why the limit was not checked; None where it was
-    unusable : why the run must not be used, which fails every limit; None where it can be
-    verdict : the line about it that is printed
+    unusable : why the run must not be used; every limit then fails. None for a usable run
+    verdict : the printed line about the limit
     """
 
     value_m: float | None
@@ -166,7 +166,7 @@ class Verdict(Gate, frozen=True, kw_only=True):
     verdict: str
 
     def line(self, log: str) -> str:
-        """Return the verdict in one line, which names the log."""
+        """Return one line with the verdict, the numbers and the name of the log."""
         word = "pass" if self.passed else "FAIL"
         log = f" (log {log})" if log else ""
         if self.not_checked:

@@ -26,7 +26,7 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
 
 
 class CalibratedRobot(Record, frozen=True, kw_only=True):
-    """The robot; `left_scale` and `right_scale` are `Run.radius_errors`, left out where they are 1."""
+    """The robot of a calibration. `left_scale` and `right_scale` are `Run.radius_errors`; a scale of 1 is left out."""
 
     name: str | None = None
     wheel_radius_m: UpTo1000 | None = None
@@ -38,7 +38,7 @@ class CalibratedRobot(Record, frozen=True, kw_only=True):
 
 
 class PooledScore(Record, frozen=True):
-    """Errors of one model at one horizon, over all held-out trials together: of all logs, or of the blocks of one."""
+    """Errors of one model at one horizon over all held-out trials: of all logs, or of all blocks of a single log."""
 
     model: str
     horizon_m: float
@@ -47,7 +47,7 @@ class PooledScore(Record, frozen=True):
 
 
 class HeldOutScore(PooledScore, frozen=True):
-    """Errors of one model at one horizon on a log, or block of one, that it was not fitted to."""
+    """Errors of one model at one horizon on a log, or on a block of a log, that the model was not fitted to."""
 
     log: str
 
@@ -62,7 +62,7 @@ class MeasuredConstant(Record, frozen=True):
 class SensorConstants(Record, frozen=True, kw_only=True):
     """Constants of the sensors of a log, with respect to the streams as they were sent; None: not known.
 
-    They are needed in addition to a motion model.
+    A user of a motion model needs these constants too.
 
     Attributes
     ----------
@@ -79,13 +79,13 @@ class SensorConstants(Record, frozen=True, kw_only=True):
 
 
 class LogSensors(Record, frozen=True):
-    """Constants of the sensors of one log, corrections before the fit included, for both models of a calibration.
+    """Constants of the sensors of one log for both models of a calibration; corrections before the fit are included.
 
     Attributes
     ----------
-    heading_source : kind of its heading, as in ``heading`` of run.json; empty where it is not known
-    wheels, gyro : for the recommended model with wheels alone, and with a gyro; they were measured with the parameters
-        of the calibration
+    heading_source : kind of the log's heading, as in ``heading`` of run.json; empty where it is not known
+    wheels, gyro : constants for the recommended model with wheels alone, and for the model with a gyro. They were
+        measured with the parameters of the calibration
     """
 
     heading_source: str
@@ -98,7 +98,7 @@ class HeldSensors(Record, frozen=True):
 
     Attributes
     ----------
-    held : what the logs of the calibration give for a further drive, with its standard deviation; None: not known
+    held : constants for a further drive, by the logs of the calibration, with standard deviations
     measured : the constants that this log shows with the same parameters; None where the drive is too short
     refitted : the row has the constants of this log in place of the held ones
     """
@@ -109,14 +109,14 @@ class HeldSensors(Record, frozen=True):
 
 
 class CalibrationLog(Record, frozen=True):
-    """A log that a calibration was fitted to, and its own constants.
+    """A log that a calibration was fitted to, with the constants of this log.
 
     Attributes
     ----------
-    heading_offset_deg, wheels_delay_s : offset of its heading, and delay of its poses with respect to its wheels, both
-        after the corrections before the fit
-    begin_ns : stamp of its first state; 0 where it is not known
-    ground : name of its ground, where one was given
+    heading_offset_deg, wheels_delay_s : offset of the heading [deg], and delay of the poses with respect to the wheels
+        [s], both after the corrections before the fit
+    begin_ns : stamp of the first state; 0 where it is not known
+    ground : name of the ground, where the user gave a name
     sensors : the constants of its sensors, corrections included; None in a file of an earlier version
     """
 
@@ -142,17 +142,18 @@ class GroundScore(Record, frozen=True):
 
 
 class ControllerErrors(Record, frozen=True):
-    """Errors of what a controller can express, on distance it was not fitted to.
+    """Errors of the motion model that a controller can express, on distance that the model was not fitted to.
 
     Attributes
     ----------
-    pose_variance : (3,) of x forward, y left, yaw [m^2, m^2, rad^2] after 10 m
-    twist_variance : (3,) of velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
+    pose_variance : (3,) variances of x forward, y left, yaw after 10 m [m^2, m^2, rad^2]
+    twist_variance : (3,) variances of the velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
     turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
-    p95_m, full_p95_m : after 10 m, of the controller's model and of the recommended model; None without a trial of 10 m
+    p95_m, full_p95_m : 95th percentile of the error after 10 m [m], of the controller's model and of the recommended
+        model; None without a trial of 10 m
     twist_variance_std : (3,) standard deviations of `twist_variance`; None in files of older versions
-    gyro_rate_variance : of the turn rate of the model with a gyro, averaged over 1 m [rad^2/s^2], with its standard
-        deviation; None without a gyro
+    gyro_rate_variance, gyro_rate_variance_std : variance of the turn rate of the model with a gyro, averaged over 1 m
+        [rad^2/s^2], and its standard deviation; None without a gyro
     """
 
     pose_variance: tuple[float, float, float]
@@ -167,7 +168,7 @@ class ControllerErrors(Record, frozen=True):
 
 
 class ControllerDocument(ControllerNumbers, frozen=True, kw_only=True):
-    """What a controller is given, and its `ControllerErrors` where they were measured."""
+    """Numbers for a controller; with the fields of `ControllerErrors` where errors were measured."""
 
     pose_variance: tuple[float, float, float] | UnsetType = UNSET
     twist_variance: tuple[float, float, float] | UnsetType = UNSET
@@ -232,7 +233,10 @@ SensorVerdict = Literal["shown", "weak", "not shown", "not separable", "given"]
 
 
 class SensorParameter(Record, frozen=True):
-    """One parameter of antenna, offsets, delays or scales by one log; null where not determined. `note`: why."""
+    """One parameter of the sensors (antenna, offset, delay, scale), by one log; null where the log does not show it.
+
+    `note` is the reason for the verdict.
+    """
 
     value: float | None
     std: float | None
@@ -257,8 +261,8 @@ class CalibrationFile(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     log, inputs : name and files of the log
-    windows, independent_stretches : windows of driven distance, and how many count as independent
-    window_miss_m : robust standard deviation of their displacements
+    windows, independent_stretches : number of windows of driven distance, and number of independent windows
+    window_miss_m : robust standard deviation of the residual displacements of the windows [m]
     settings : configuration keys whose values the log shows
     alignment : estimates of the sensors
     """
@@ -275,7 +279,7 @@ class CalibrationFile(Record, frozen=True, kw_only=True):
 
 
 class SensorDocument(CalibrationFile, frozen=True, kw_only=True):
-    """What one log shows of its sensors: a calibration file without a motion model.
+    """Calibration file without a motion model: the parameters of the sensors that one log shows.
 
     Attributes
     ----------

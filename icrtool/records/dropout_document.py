@@ -1,4 +1,4 @@
-"""report.json: what a dropout report holds; unknown numbers are null. Also paths for pictures."""
+"""Records of report.json, in which an unknown number is null; and the paths that pictures of a report show."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DROPOUT_SCHEMA: Literal["icrtool/dropout/1"] = "icrtool/dropout/1"
 """Version of what report.json holds."""
 
 LARGEST_M = 1e12
-"""Largest number in a report. A larger number is damage, and its square overflows."""
+"""Largest number in a report. A larger number shows that the file is damaged, and its square overflows."""
 
 Number = Annotated[float, Meta(ge=-LARGEST_M, le=LARGEST_M)] | None
 Numbers = list[Number]
@@ -34,12 +34,12 @@ Count = Annotated[int, Meta(ge=0, le=10**12)]
 
 
 def column_of(rows: Sequence[Record], name: str) -> Floats:
-    """Return a number of each row, NaN where there is none."""
+    """Return a column (n,): one number for each row, NaN where a row has no number."""
     return np.array([math.nan if (value := getattr(row, name)) is None else value for row in rows], np.float64)
 
 
 class RunOfReport(Record, frozen=True):
-    """What a report holds of its run."""
+    """The fields of its run that a report holds."""
 
     schema: Literal["icrtool/run/1"]
     tool_version: str
@@ -98,7 +98,7 @@ class BlocksDocument(Record, frozen=True):
 
 
 class ModelDocument(Record, frozen=True):
-    """A model's errors; `words`: what predicts its motion; `knows`: what its numbers were learned from."""
+    """A model's errors. `words`: what predicts the motion; `knows`: the data that the parameters come from."""
 
     name: str
     words: str
@@ -112,7 +112,7 @@ class ModelDocument(Record, frozen=True):
 
 
 class CountDocument(Record, frozen=True):
-    """How many starts were a trial at a horizon, and why the others were none."""
+    """Number of starts that give a trial at a horizon, and numbers of the other starts by reason."""
 
     horizon_m: float
     trials: int
@@ -121,7 +121,7 @@ class CountDocument(Record, frozen=True):
 
 
 class ReferenceRow(Record, frozen=True):
-    """The reference's own error at a horizon: what a perfect model would show."""
+    """Error of the reference at a horizon: the error that a perfect model would show."""
 
     horizon_m: float
     std_m: Number
@@ -134,8 +134,8 @@ class LearnedDocument(Record, frozen=True):
 
     Attributes
     ----------
-    learned_s, learned_at_distance_m : when and where they were learned, seconds and metres since the first recorded
-        state; None where they never were: all trials are before
+    learned_s, learned_at_distance_m : time [s] and distance [m] since the first recorded state at which the ICRs were
+        learned; None where they were never learned: all trials then start before
     """
 
     model: str
@@ -146,7 +146,7 @@ class LearnedDocument(Record, frozen=True):
 
 
 class EventCostDocument(Record, frozen=True):
-    """What slip events cost: trials that cross one are left out.
+    """Errors without the trials that cross a slip event: the difference is the cost of slip events.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class EventCostDocument(Record, frozen=True):
 
 
 class ScoreDocument(Record, frozen=True):
-    """A model of the comparison: what it was fitted to, and its errors by horizon."""
+    """A model of the comparison: the data that it was fitted to, and its errors by horizon."""
 
     name: str
     fitted: str
@@ -179,7 +179,7 @@ class FitDocument(Record, frozen=True):
 
 
 class LadderDocument(Record, frozen=True):
-    """The comparison of models; `left_out`: why there is none: then all other fields are empty."""
+    """The comparison of models. `left_out` is the reason why there is none; all other fields are then empty."""
 
     left_out: str | UnsetType = UNSET
     horizons_m: list[float] | UnsetType = UNSET
@@ -197,9 +197,10 @@ class UsedCalibration(Record, frozen=True):
 
     Attributes
     ----------
-    name : of its row
-    model : of the calibration
-    logs : how many it was fitted to; fitted_to_this : this log is among them
+    name : name of its row
+    model : model of the calibration
+    logs : number of logs that the calibration was fitted to
+    fitted_to_this : whether this log is among them
     created : date and time, UTC
     with_gyro : its row uses the gyro of the log
     calibration : content of its file, without the models that were not recommended, the scores and the findings on
@@ -220,15 +221,15 @@ class UsedCalibration(Record, frozen=True):
 
 
 class StartHeading(Record, frozen=True):
-    """What the heading at the start of a trial costs: errors of a row as they are, and with aligned start headings.
+    """Errors of a row as they are and with aligned start headings: the difference is the cost of the start heading.
 
     Attributes
     ----------
-    expected_m, p95_m : as the row has them
-    aligned_expected_m, aligned_p95_m : of the paths that begin in the direction of the reference's first metres
+    expected_m, p95_m : errors of the row [m]
+    aligned_expected_m, aligned_p95_m : errors of the paths that begin in the direction of the reference's first metres
     dominates : more than half of the square of p95 is due to the heading at the start, beyond the interval of the
         difference
-    mend : what the user can do about it
+    mend : what the user can do to get better start headings
     """
 
     expected_m: float
@@ -244,9 +245,10 @@ class BestRow(Record, frozen=True):
 
     Attributes
     ----------
-    model : its name; horizon_m : where errors are compared, 10 m or the nearest distance with trials
+    model : name of the row
+    horizon_m : distance at which errors are compared: 10 m, or the nearest distance with trials
     as_good : rows for comparison (no_slip, vendor) whose expected error is not shown to be larger
-    start_heading : what its start headings cost; missing where it is not known
+    start_heading : cost of the start headings of this row; missing where it is not known
     """
 
     model: str
@@ -266,7 +268,7 @@ class TurningSplit(Record, frozen=True):
 
 
 class BaselineDocument(Record, frozen=True):
-    """What the report was compared with, and what differs in addition to the numbers."""
+    """The earlier report that a report was compared with, and the differences that are not numbers."""
 
     path: str
     log: str
@@ -281,9 +283,10 @@ class OutageDocument(Record, frozen=True):
     Attributes
     ----------
     begin_s, end_s : seconds since the first recorded state
-    distance_m : path driven through it
-    end_error_m, max_error_m : forced: against the undisturbed estimate; real: against the fixes that ended it (both
-        the same)
+    distance_m : distance driven during the outage [m]
+    end_error_m, max_error_m : error at the end, and largest error [m]. The error of a forced outage is the difference
+        from the undisturbed estimate; the error of a real outage is the difference from the first fixes after it, and
+        both numbers are equal
     """
 
     kind: Literal["forced", "real"]
@@ -295,7 +298,7 @@ class OutageDocument(Record, frozen=True):
 
 
 class TrialDocument(Record, frozen=True):
-    """A trial; `model`: by whose error it was chosen."""
+    """A trial. `model` names the model whose error the trial was chosen by."""
 
     model: str
     stamp_ns: int
@@ -321,11 +324,11 @@ class ModelResult(NamedTuple):
 
     Attributes
     ----------
-    document : as report.json holds them
-    histograms : by horizon
-    block_sums : by horizon, to all digits; None where there is too little path
-    without_events : by horizon, of the trials that touch no slip event; empty where the run has none
-    aligned : by horizon, with aligned start headings; None where they are not known
+    document : the errors as report.json holds them
+    histograms : histograms of the errors by horizon
+    block_sums : sums over blocks of path by horizon, to all digits; None where the path is too short
+    without_events : errors by horizon of the trials that touch no slip event; empty where the run has no slip event
+    aligned : errors by horizon with aligned start headings; None where these headings are not known
     """
 
     document: ModelDocument
@@ -379,11 +382,11 @@ class ExampleTrial:
 
 @dataclass(frozen=True, slots=True)
 class PathErrors:
-    """Errors of one model's trials by the place where they start, for a picture.
+    """Errors of one model's trials by the place where each trial starts, for a picture.
 
     Attributes
     ----------
-    model : its name
+    model : name of the model
     horizon_m : length of the trials
     start : states (k,) at which they start, increasing
     error_m : (k,)
@@ -396,7 +399,7 @@ class PathErrors:
 
 
 class IntervalsDocument(Record, frozen=True):
-    """How the intervals were found.
+    """Probabilities of the intervals in a report.
 
     Attributes
     ----------

@@ -16,8 +16,8 @@ class Explanation(NamedTuple):
     Attributes
     ----------
     grade : of every finding with this code
-    cause : what was found, and what it comes from
-    consequence : what it does to the numbers
+    cause : what was found, and where it comes from
+    consequence : the effect on the numbers
     action : what the user can do
     """
 

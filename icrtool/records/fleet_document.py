@@ -1,4 +1,4 @@
-"""fleet.json: what a batch found of each log, and the calibration of each robot and group."""
+"""Records of fleet.json: the result of a batch for each log, and the calibration of each robot and group."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from icrtool.records.plain_data import Record
 from icrtool.records.rows import FALLBACK_ROW, MAIN_ROW
 
 FLEET_SCHEMA: Literal["icrtool/fleet/1"] = "icrtool/fleet/1"
-"""Version of what fleet.json holds."""
+"""Version of the content of fleet.json."""
 
 FLEET_FILE = "fleet.json"
 """Name of the file with the result of a batch, in its folder."""
@@ -21,18 +21,18 @@ FLEET_FAMILY = "icrtool/fleet/"
 """First characters of the schema of a fleet.json, of any version."""
 
 RUNS, ROWS = "runs", ".rows"
-"""Folders of a batch: the runs, and the rows of the logs, each written when its log is done."""
+"""Names of folders of a batch: of the runs, and of the rows. The row of a log is written when the log is done."""
 
 BUDGET_M = 0.5
 """Position error that defines the distance stated for a calibration [m]."""
 
 SHOWN_ERROR, SHOWN_FALLBACK = f"{MAIN_ROW}_p95_10m_m", f"{FALLBACK_ROW}_p95_10m_m"
-"""The error of each log that is printed, drawn and compared with the baseline; the second where no held-out error
-exists."""
+"""Names of the error of each log that is printed, drawn and compared with the baseline. The second name is used where
+a log has no held-out error."""
 
 
 def next_low_name(model: str, budget_m: float) -> str:
-    """Return the name in `FleetLog.errors` of the distance that the next drive keeps within a budget, 9 of 10."""
+    """Return the name in `FleetLog.errors` of the distance over which 9 of 10 next drives stay within a budget."""
     return f"{model}_next_low_{budget_m:g}m_m"
 
 
@@ -41,7 +41,7 @@ ThisTime = Literal["processed", "skipped"]
 
 
 class FleetVerdict(Record, frozen=True, kw_only=True):
-    """An acceptance limit of a log, as `icrtool.records.acceptance.Verdict`; `gate` is its text."""
+    """Verdict on an acceptance limit, as `icrtool.records.acceptance.Verdict`. `gate` is the text of the limit."""
 
     gate: str
     value_m: float | None
@@ -57,7 +57,7 @@ class FleetVerdict(Record, frozen=True, kw_only=True):
 
 
 def fleet_verdict(verdict: Verdict, log: str) -> FleetVerdict:
-    """Return an acceptance limit under the keys of fleet.json, with the line about it, which names the log."""
+    """Return a verdict under the keys of fleet.json. Its `line` names the log."""
     return FleetVerdict(
         gate=verdict.text, value_m=verdict.value_m, margin_m=verdict.margin_m, passed=verdict.passed,
         line=verdict.line(log), relative=verdict.relative, bound_m=verdict.value_bound_m, baseline_m=verdict.baseline_m,
@@ -66,14 +66,14 @@ def fleet_verdict(verdict: Verdict, log: str) -> FleetVerdict:
 
 
 class FleetFile(Record, frozen=True):
-    """A file of a log, when it was read.
+    """A file of a log, in the state in which it was read.
 
     Attributes
     ----------
-    mtime_ns : time of modification: where it and `bytes` are the same, the file is not hashed again; 0 for a file that
-        is not on a disk
+    mtime_ns : time of modification; 0 for a file that is not on a disk. Where `mtime_ns` and `bytes` are unchanged, the
+        file is not hashed again
     sha256 : None where not all of it was read
-    version : what its store states about the content, for a file that is not on a disk
+    version : version of the content by the object store or web server, for a file that is not on a disk
     address : SHA-256 of the whole address, for a file that is not on a disk
     """
 
@@ -86,23 +86,23 @@ class FleetFile(Record, frozen=True):
 
 
 class FleetLog(Record, frozen=True):
-    """What a batch knows of a log.
+    """The row of a log in a batch.
 
     Attributes
     ----------
     log : path below the common parent
     run : directory of the run, below the directory of the batch
-    status : of the result
+    status : whether the log was done or failed
     this_time : ``skipped``: the result is from an earlier batch with the same input, configuration and version
-    reason : why it failed, why its ICRs are not usable, or that the log is truncated
-    usable : whether its ICRs are usable
+    reason : why the log failed, why its ICRs are not usable, or that the log is truncated
+    usable : whether the ICRs of the log are usable
     details : last lines of the process that failed
     repeatable : whether the same input, configuration and version give this result again
     icr : final ICRs [m] and, as ``std_…``, their standard deviations
     multiplier : (y_r - y_l)/b, wheel separation multiplier of a differential-drive controller, with `multiplier_std`
     errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``; the 95 % interval
-        ``<model>_p95_low_10m_m`` to ``<model>_p95_high_10m_m``; ``<model>_next_low_<budget>m_m``, the distance within
-        the budget that the next drive keeps in 9 of 10 cases
+        ``<model>_p95_low_10m_m`` to ``<model>_p95_high_10m_m``; ``<model>_next_low_<budget>m_m``, the distance over
+        which 9 of 10 next drives stay within the budget
     bounds : the names in `errors` whose distance is a lower bound
     outages, warnings : number of each
     notes : findings of the run, the grave ones among them
@@ -144,7 +144,7 @@ class FleetLog(Record, frozen=True):
 
     @property
     def codes(self) -> tuple[str, ...]:
-        """The codes of its findings, each once."""
+        """The codes of the log's findings, each once."""
         return tuple(dict.fromkeys(one.code for one in self.notes))
 
     def shown_error(self, *, baseline: bool = False) -> float | None:
@@ -154,7 +154,7 @@ class FleetLog(Record, frozen=True):
 
     @property
     def gates_failed(self) -> int:
-        """How many acceptance limits were missed."""
+        """Number of acceptance limits that the log does not meet."""
         return sum(not verdict.passed for verdict in self.verdicts)
 
 
@@ -192,7 +192,7 @@ class FleetCalibration(Record, frozen=True):
 
     @property
     def within(self) -> BudgetDistance | None:
-        """How far the held-out errors stay within `BUDGET_M`; None where that is not known."""
+        """Distance over which 95 % of the held-out errors stay within `BUDGET_M`; None where it is not known."""
         if self.within_m is None:
             return None
         between_m = self.within_between_m or (self.within_m, self.within_m)
@@ -200,14 +200,14 @@ class FleetCalibration(Record, frozen=True):
 
     @property
     def within_text(self) -> str:
-        """How far, as ``, within 0.5 m (95 %) for about 15 m with recommended``; empty where that is not known."""
+        """`within` as ``, within 0.5 m (95 %) for about 15 m with recommended``; empty where it is not known."""
         if self.within is None:
             return ""
         return f", within {BUDGET_M:g} m (95 %) for {self.within.short_text} with {MAIN_ROW}"
 
 
 class FleetCounts(Record, frozen=True):
-    """How many logs were done and failed, and how many of them by an earlier batch."""
+    """Numbers of logs that were done and that failed, and number of these that an earlier batch processed."""
 
     done: int
     failed: int
@@ -215,7 +215,7 @@ class FleetCounts(Record, frozen=True):
 
 
 class FleetDocument(Record, frozen=True, kw_only=True):
-    """fleet.json; `output`: the folder of the batch, in what ``--json`` prints."""
+    """Content of fleet.json. `output` is the folder of the batch; only the output of ``--json`` has it."""
 
     schema: Literal["icrtool/fleet/1"]
     tool_version: str

@@ -1,6 +1,6 @@
-"""Limits of what is read from standard input and from servers.
+"""Limits on the input from standard input and from servers.
 
-The environment of the process holds them: the processes that a batch starts inherit it.
+The limits are environment variables, because the processes of a batch inherit the environment.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import TypeVar
 from icrtool.errors import ConfigError
 
 MOST_BYTES, SERVER_TIMEOUT_S = "ICRTOOL_MOST_BYTES", "ICRTOOL_SERVER_TIMEOUT_S"
-"""Environment variables with the limits: bytes that are saved of an input, and seconds in which a server may send
-nothing."""
+"""Names of the environment variables with the limits: largest size of a saved input [bytes], and longest time in which
+a server may send nothing [s]."""
 
 QUIET_S = 15.0
 """Longest time in which a server may send nothing, where nothing else is set [s]."""
@@ -59,7 +59,7 @@ def seconds_in(text: str) -> float:
 
 
 def most_bytes() -> int | None:
-    """Return how many bytes of an input are saved at most; None where nothing states it.
+    """Return the largest size of a saved input [bytes]; None without a limit.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def server_timeout_s() -> float:
 
 
 def _of_environment(variable: str, parse: Callable[[str], Limit]) -> Limit | None:
-    """Return the limit that an environment variable states; None where it states nothing."""
+    """Return the limit in an environment variable; None where the variable is not set."""
     if not (text := os.environ.get(variable)):
         return None
     try:
@@ -93,7 +93,7 @@ def _of_environment(variable: str, parse: Callable[[str], Limit]) -> Limit | Non
 
 @contextmanager
 def set_limit(variable: str, value: float) -> Iterator[None]:
-    """Have a limit in the environment of this process until the block ends."""
+    """Set a limit in the environment of this process until the block ends."""
     before = os.environ.get(variable)
     os.environ[variable] = f"{value!r}"
     try:

@@ -1,4 +1,4 @@
-"""The codes of what is found in logs and by the alignment; see `icrtool.records.note_catalogue`."""
+"""The codes of findings about logs and of findings of the alignment; see `icrtool.records.note_catalogue`."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ OF_FILES: dict[str, Explanation] = {
         "Check the driver of the wheels.",
     ),
 }
-"""Codes of what was found while files were read."""
+"""Codes of findings about files."""
 
 OF_CLOCKS: dict[str, Explanation] = {
     "clock_shifted": Explanation(
@@ -154,7 +154,7 @@ OF_CLOCKS: dict[str, Explanation] = {
         "None is needed. `frames.reference_delay_s` and `frames.heading_delay_s` set a known delay.",
     ),
 }
-"""Codes of what was found of clocks."""
+"""Codes of findings about clocks."""
 
 OF_WHEELS: dict[str, Explanation] = {
     "ground_changed": Explanation(
@@ -326,7 +326,7 @@ OF_WHEELS: dict[str, Explanation] = {
         "Check the names of the wheels. Drive turns to both sides.",
     ),
 }
-"""Codes of what was found of the wheels."""
+"""Codes of findings about wheels."""
 
 OF_POSITIONS: dict[str, Explanation] = {
     "positions_interpolated": Explanation(
@@ -403,7 +403,7 @@ OF_POSITIONS: dict[str, Explanation] = {
         "Set `frames.antenna_forward_m` and `frames.antenna_right_m`.",
     ),
 }
-"""Codes of what was found of the positions."""
+"""Codes of findings about positions."""
 
 OF_HEADINGS: dict[str, Explanation] = {
     "heading_mounting": Explanation(
@@ -485,4 +485,4 @@ OF_HEADINGS: dict[str, Explanation] = {
         "Record an IMU, and check its mounting.",
     ),
 }
-"""Codes of what was found of the headings."""
+"""Codes of findings about headings."""

@@ -24,13 +24,14 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One estimate of the alignment, and what was done with it.
+    """One estimate of the alignment, and the correction that was made with it.
 
     Attributes
     ----------
-    value, std : the estimate and its standard deviation, None where the drive does not show it; unit in its name
-    applied : the correction that the measurements hold
-    why : why it was applied or not
+    value, std : the estimate and its standard deviation, None where the drive does not show it; the name of the finding
+        ends with the unit
+    applied : the correction that was made to the measurements
+    why : why the correction was made, or why not
     """
 
     value: float | None
@@ -45,12 +46,12 @@ class Fixes(Samples):
 
     Attributes
     ----------
-    stamp_ns : int64 (m,), non-decreasing, of the wheels' clock
+    stamp_ns : int64 (m,), non-decreasing, by the clock of the wheels
     north_m, east_m : float64 (m,)
     var_north_m2, var_east_m2 : float64 (m,), finite
     fix_class : uint8 (m,), keys of `icrtool.alignment.gnss_quality.CLASSES`
-    misreported : bool (m,), reported as RTK-fixed, but not a fixed solution
-    down_weighted : bool (m,), given a larger variance for their class
+    misreported : bool (m,), whether a fix is reported as RTK-fixed, but is not a fixed solution
+    down_weighted : bool (m,), whether a fix has a larger variance because of its class
     """
 
     stamp_ns: Ints
@@ -64,25 +65,25 @@ class Fixes(Samples):
 
 
 class IcrStart(Record, frozen=True):
-    """ICRs to start the filter from, right, left, x, and their standard deviations (3,) [m]."""
+    """Initial ICRs of the filter (3,), right, left, x, and their standard deviations (3,) [m]."""
 
     icrs_m: Triple
     std_m: Triple
 
 
 class LogFacts(Record, frozen=True, kw_only=True):
-    """What is known of a log in addition to its streams; ``facts`` of run.json.
+    """Facts of a log in addition to its streams; ``facts`` of run.json.
 
     Attributes
     ----------
     heading_from_position : heading and position are fields of the same messages: they have the same delay
-    heading_correlation_s : the errors of headings closer together than this are correlated
+    heading_correlation_s : correlation time of the errors of headings [s]
     heading_is_estimated : the headings are estimated with the positions, and do not exist without positions
     heading_is_measured : the variance of the headings is the measured variance of a reference's poses
-    turn_wander_rad : how far the heading wanders from the turn of the wheels in a second (rms), noise included; None:
-        not known
-    antenna_m : the antenna from the body origin, forward and right
-    antenna_is_known : its place was configured, or in the log
+    turn_wander_rad : rms difference between the turns of heading and wheels over 1 s [rad], noise included; None: not
+        known
+    antenna_m : position of the antenna from the body origin, forward and right [m]
+    antenna_is_known : the position of the antenna was configured, or is in the log
     clock_std_s : standard deviation of the time between position and heading, after the correction of delays
     heading_sensor : topic of the log that states a heading, also where it is fused with others; None without one
     """
@@ -109,14 +110,15 @@ class SensorData:
 
     Attributes
     ----------
-    name : of the log
+    name : name of the log
     headings : clockwise from north, offset corrected; every variance finite
     gyro : turn rates, not used by the filter; None without a gyro
     facts : everything that is no column and no span of time
     losses_ns : half-open spans in which RTK was lost, (k, 2)
     events : slip events, in order of time
-    jumps : of the reference, likewise
-    attitude : an attitude sensor's heading, its offset corrected, where `headings` are estimated with it; else None
+    jumps : jumps of the reference, in order of time
+    attitude : heading of an attitude sensor after correction of its offset, where `headings` are estimated with this
+        sensor; else None
     """
 
     name: str
@@ -131,9 +133,9 @@ class SensorData:
     attitude: HeadingSamples | None = None
 
     def moving(self) -> tuple[Bools, Bools]:
-        """Return at which fixes (m,) and headings (h,) the wheels turn within `MOVING_S`; all where they never turn.
+        """Return at which fixes (m,) and headings (h,) the wheels turn within `MOVING_S`; all True if they never turn.
 
-        Measurements of a standing robot show neither delays nor contradictions, however long it stands.
+        Measurements of a standing robot show neither delays nor contradictions, so they are left out.
         """
         stamps = self.wheels.stamp_ns
         turning = np.empty(len(stamps), np.bool_)
@@ -144,7 +146,7 @@ class SensorData:
         if len(stamps) > 1:
             near = max(round(MOVING_S * 1e9), 2 * int(np.median(np.diff(stamps), overwrite_input=True)))
         begin, behind = runs_of(turning)
-        # the last value holds until the next one
+        # a wheel speed holds until the next sample
         spans = stamps[begin] - near, stamps[np.minimum(behind, len(stamps) - 1)] + near
 
         def of(stamp_ns: Ints) -> Bools:
@@ -154,7 +156,7 @@ class SensorData:
         return of(self.fixes.stamp_ns), of(self.headings.stamp_ns)
 
     def part(self, rows: slice) -> SensorData:
-        """Return the part of some wheel samples, with the fixes and headings of that time."""
+        """Return the sensor data of some wheel samples, with the fixes and headings of the same time."""
         wheels = self.wheels.cut(rows)
         span = wheels.stamp_ns[[0, -1]]
         fixes = slice(*np.searchsorted(self.fixes.stamp_ns, span))
@@ -168,8 +170,8 @@ class FixStatistics:
 
     Attributes
     ----------
-    std_m : by class name, median standard deviation stated or measured [m], NaN where none is known
-    step_std_m : by class name, white noise from step to step [m]; NaN where too few steps show it
+    std_m : median standard deviation, stated or measured, by class name [m]; NaN where it is not known
+    step_std_m : standard deviation of the white noise from step to step, by class name [m]; NaN with too few steps
     """
 
     std_m: dict[str, float]
@@ -192,21 +194,22 @@ class GroundStretch(Record, frozen=True, kw_only=True):
 
 
 class WheelFacts(Record, frozen=True, kw_only=True):
-    """What is known of the wheels, and what was done with it; as ``wheels`` in run.json.
+    """Facts of the wheels, and the corrections that were made; ``wheels`` of run.json.
 
     Attributes
     ----------
-    scale, scale_std : distance by the position reference per distance by the wheels; None where not shown
-    applied_scale : mean of what both sides were multiplied with
-    applied_left_scale, applied_right_scale : what each was multiplied with, configured scales included
-    held_share : share of samples, while moving, that repeat the one before
-    filtered : in words, how the wheels show that a filter made them; None where they do not
-    windows, stretches : windows in which wheels and positions were compared, and how many count as independent
-    residual_m : robust standard deviation of their displacements; None without windows
+    scale, scale_std : distance by the position reference over distance by the wheels, and its standard deviation; None
+        where the drive does not show it
+    applied_scale : mean of the factors that were applied to both sides
+    applied_left_scale, applied_right_scale : factor that was applied to each side, configured scales included
+    held_share : share of the samples of a moving robot that repeat the sample before
+    filtered : in words, what shows that the wheel speeds are the output of a filter; None where nothing shows it
+    windows, stretches : number of windows in which wheels and positions were compared, and number of independent ones
+    residual_m : robust standard deviation of the residual displacements of the windows [m]; None without windows
     turn_unexplained, turn_unexplained_std : share of the variance of the robot's turns over a second that the wheels do
         not explain, 1 - R^2, and its standard deviation; None without windows
-    ground_change_s : when the ground first changes, since the first wheel sample; None where it does not
-    ground_stretches : the stretches between changes of ground; none where it does not change
+    ground_change_s : time of the first change of ground since the first wheel sample [s]; None without a change
+    ground_stretches : the stretches between changes of ground; empty without a change
     """
 
     scale: float | None
@@ -226,19 +229,20 @@ class WheelFacts(Record, frozen=True, kw_only=True):
 
 
 class HeadingFacts(Record, frozen=True, kw_only=True):
-    """What is known of the heading, and what is done with it; in ``heading`` of run.json.
+    """Facts of the heading, and the corrections that were made; in ``heading`` of run.json.
 
     Attributes
     ----------
     source : orientation, dual_antenna_message, antenna_pair, gyro_course, wheels_course or fused
     parts : the sensors of an estimated heading, in words; None for a stated heading
-    windows : stretches of distance compared
-    applied_mirror : the sense of the heading is reversed
-    offset_deg, offset_std_deg : heading minus course over ground; None when there was nothing to compare
+    windows : number of stretches of distance in which the heading was compared with the course over ground
+    applied_mirror : the sense of the heading was reversed
+    offset_deg, offset_std_deg : heading minus course over ground; None where no window could be compared
     scatter_deg : robust standard deviation of the differences
-    applied_offset_deg : what is subtracted; applied_std_deg : the least noise that the filter uses
+    applied_offset_deg : offset that was subtracted from the heading
+    applied_std_deg : smallest standard deviation of the heading that the filter uses
     std_deg : median standard deviation of an estimated heading, as the filter uses it; None for a stated heading
-    offset_name : what a significant offset may come from
+    offset_name : possible cause of a significant offset
     agreement, mirrored_agreement : mean resultant length of heading minus course over ground, in either sense
     """
 
@@ -261,13 +265,13 @@ class HeadingFacts(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """The aligned sensors of one log, and what the alignment found.
+    """The aligned sensors of one log, and the findings of the alignment.
 
     Attributes
     ----------
     findings : estimates by name with unit; run.json has them as ``alignment``
     streams : the log's chosen topics; ``why`` also names the unit of the wheels
-    wheels, heading : what is known of them, for run.json
+    wheels, heading : facts of wheels and heading, for run.json
     notes : findings, in the order they were made
     """
 
@@ -286,9 +290,9 @@ class MeasuredHeading:
 
     Attributes
     ----------
-    kind : ``heading``: an attitude, its direction is taken as measured; ``gyro``: an integrated turn rate, which starts
-        from the reference heading and is given scale and bias by the distance outside the block
-    angle_rad : (n,), clockwise, unwrapped
+    kind : ``heading``: the heading of an attitude sensor, used as measured. ``gyro``: an integrated turn rate, which
+        starts from the reference heading; its scale and bias are estimated outside the tested block
+    angle_rad : (n,), clockwise, unwrapped [rad]
     """
 
     kind: Literal["heading", "gyro"]
@@ -296,11 +300,12 @@ class MeasuredHeading:
 
 
 SlipKind = Literal["immobilised", "slip", "skid", "spin"]
-"""Wheels turn and the robot stands; it moves less than its wheels; it moves sideways; it turns less than expected."""
+"""Kinds of slip events. ``immobilised``: the wheels turn and the robot stands; ``slip``: the robot moves less than its
+wheels; ``skid``: it moves sideways; ``spin``: it turns less than expected."""
 
 
 class SlipEvent(Record, frozen=True):
-    """One span in which the robot did not do what its wheels did.
+    """One span of time in which the motion of the robot differs from the motion of its wheels.
 
     Attributes
     ----------
@@ -322,21 +327,22 @@ class SlipEvent(Record, frozen=True):
 
 
 JumpKind = Literal["position", "heading"]
-"""What jumps: the position, alone or with the heading, or the heading alone."""
+"""Kinds of jumps. ``position``: the position jumps, alone or with the heading; ``heading``: the heading jumps alone."""
 
 
 class ReferenceJump(Record, frozen=True):
-    """One discontinuity of the reference: it moves as no robot can, or as its own messages explain.
+    """One discontinuity of the reference: a motion that no robot can make, or that the reference's messages explain.
 
     Attributes
     ----------
     begin_ns, end_ns : stamps of the wheel clock, from the last pose before to the first after that the filter followed
-    north_m, east_m : position before it, in the local plane
-    size_m : largest step of the position within it, beyond the motion of the wheels
-    turn_deg : likewise of the heading, clockwise; 0 where the heading is not stated with the position
-    moved_north_m, moved_east_m : sum of its steps [m]
-    why : what shows it
-    undecided : it may be the robot's own motion: its trials count
+    north_m, east_m : position before the jump, in the local plane [m]
+    size_m : largest step of the position during the jump, beyond the motion of the wheels [m]
+    turn_deg : largest step of the heading beyond the turn of the wheels, clockwise; 0 where the heading is not stated
+        with the position
+    moved_north_m, moved_east_m : sum of the steps of the position [m]
+    why : what shows the jump
+    undecided : the jump may be motion of the robot, so trials that cross the jump count
     """
 
     kind: JumpKind
@@ -353,7 +359,7 @@ class ReferenceJump(Record, frozen=True):
 
 
 def intervals_in(stamps_ns: Ints, spans_ns: Iterable[tuple[int, int]]) -> Bools:
-    """Return which intervals [k, k + 1) between stamps (n,) share time with a span; the last is none."""
+    """Return whether each interval [k, k + 1) between stamps shares time with a span (n,); the last value is False."""
     inside, ends = np.zeros(len(stamps_ns), np.bool_), np.append(stamps_ns[1:], stamps_ns[-1:])
     for begin, end in spans_ns:
         inside[np.searchsorted(ends, begin, side="right") : np.searchsorted(stamps_ns, end)] = True

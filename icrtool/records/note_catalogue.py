@@ -1,4 +1,4 @@
-"""The codes of all findings, each with its grade, cause, consequence and what to do. docs/warnings.md is made of it.
+"""The codes of all findings, each with its grade, cause, consequence and what to do: the source of docs/warnings.md.
 
 The codes of logs are in `icrtool.records.log_codes`; the codes of runs, reports and calibrations are here.
 """
@@ -70,7 +70,7 @@ OF_RUNS: dict[str, Explanation] = {
         "Drive two full turns on the spot to each side, on one ground.",
     ),
 }
-"""Codes of what a run shows."""
+"""Codes of findings about a run."""
 
 OF_UNUSABLE_RUNS: dict[str, Explanation] = {
     "nothing_shown": Explanation(

@@ -20,7 +20,7 @@ GRAVE: Grade = "grave"
 
 
 _PARTS = re.compile("[:;] ")
-"""What stands between the parts of a finding's text."""
+"""Separators between the parts of a finding's text."""
 
 
 class Note(Record, frozen=True):
@@ -30,7 +30,7 @@ class Note(Record, frozen=True):
     ----------
     code : a key of `CATALOGUE`
     grade : ``info``: corrected, or of little consequence; ``warning``: numbers may be wrong; ``grave``: do not use them
-    subject : name of the log or file that it is about; empty where the document is about one log
+    subject : name of the log or file that the finding is about; empty in a document about one log
     text : what was found with its numbers, what was done, and what the user can do
     """
 
@@ -41,7 +41,7 @@ class Note(Record, frozen=True):
 
     @property
     def sentence(self) -> str:
-        """The text, after the name of its subject."""
+        """The name of the subject, a colon and the text; the text alone without a subject."""
         return f"{self.subject}: {self.text}" if self.subject else self.text
 
     @property
@@ -63,7 +63,7 @@ def note(code: str, text: str, subject: str = "") -> Note:
 
 
 def notes_about(subject: str, notes: Iterable[Note]) -> tuple[Note, ...]:
-    """Return findings with a log or file of this name as their subject."""
+    """Return the findings with `subject`, the name of a log or file, as their subject."""
     plain = str.__str__(subject)
     return tuple(msgspec.structs.replace(one, subject=plain) for one in notes)
 
@@ -89,6 +89,6 @@ def first_to_read(notes: Sequence[Note]) -> Note | None:
 
 
 def gravest(notes: Iterable[Note]) -> list[Note]:
-    """Return the findings below grave, by their grade, the highest first; of one grade, as they were made."""
+    """Return the findings that are not grave, the highest grade first; findings of one grade keep their order."""
     shown = [one for one in notes if not is_grave(one)]
     return sorted(shown, key=lambda one: -GRADES.index(one.grade))

@@ -1,8 +1,8 @@
 """Places of logs and results: files that somebody else may have put there, and addresses such as ``s3://b/drive.mcap``.
 
-Files are opened as regular files, and below a directory without any link. The path that a user names is followed,
-wherever links lead. What lies below it may come from a stranger: a link there could lead to any file of the user, and a
-pipe or a device would never end.
+Only regular files are opened. Links in the path that a user names are followed. Below a directory no link is followed,
+because its files may come from a stranger: a link could lead to any file of the user. Pipes and devices are refused,
+because their reading may never end.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LARGEST_DOCUMENT_BYTES = 1 << 28
 
 _READ_ON_BYTES = 1 << 20
 
-# Windows has neither; there pipes are no files.
+# Windows has neither O_NONBLOCK nor O_CLOEXEC; pipes are no files there.
 _FILE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
@@ -37,12 +37,12 @@ SAVE_IT = "save what it gives to a file, and name that"
 
 _URL = re.compile(r"^([a-z][a-z0-9+.-]+)://(?!/)", re.IGNORECASE)
 SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "http", "https")
-"""The kinds of addresses that are read: object stores and web servers. Others reach files and devices of this machine,
-its memory, or programs (``file``, ``memory``, ``github``, chains with ``::``)."""
+"""Schemes of the addresses that are read: object stores and web servers. Other schemes (``file``, ``memory``,
+``github``, chains with ``::``) reach files, devices, memory or programs of this machine."""
 
 _MEANT = re.compile(rf"\b(?:([a-z][a-z0-9+.-]+):[/\\]{{2}}|({'|'.join(SCHEMES)}):[/\\])", re.IGNORECASE)
-"""What shows that a text is meant as an address, though something stands before it or a slash is missing. Such a text
-has passwords and tokens too."""
+"""Pattern of texts that are meant as addresses, although text stands before the address or a slash is missing. Such a
+text may hold passwords and tokens, which no output shows."""
 
 _LEAST_SECRET = 4
 """Length of the shortest secret that is removed from texts of libraries, in characters."""
@@ -58,7 +58,7 @@ class NotRegularFileError(OSError):
 
 @dataclass(frozen=True, slots=True)
 class Below:
-    """A file or a folder below a folder, where it is read or written without following a link below that folder.
+    """A file or a folder below a folder. It is read and written without following a link below that folder.
 
     Attributes
     ----------
@@ -75,12 +75,12 @@ class Below:
         return self.folder / self.name
 
     def check_links(self) -> None:
-        """Refuse a path that is a link or leads over one.
+        """Refuse a path that is a link or leads over a link.
 
         Raises
         ------
         NotRegularFileError
-            It does, or does not lie below the folder.
+            The path is a link or leads over a link, or it does not lie below the folder.
         """
         above, parts = self.folder, PurePath(self.name).parts
         if ".." in parts or PurePath(self.name).is_absolute():
@@ -101,25 +101,25 @@ def path_of(place: Place) -> Path:
 
 
 def below(folder: Path | None, path: Path) -> Place:
-    """Return a path as one below a folder; the path itself where the folder is None, because the user named the path.
+    """Return a path as `Below` a folder; the path itself where the folder is None, because the user named the path.
 
     Raises
     ------
     ValueError
-        It does not begin with the folder.
+        The path does not begin with the folder.
     """
     return path if folder is None else Below(folder, path.relative_to(folder))
 
 
 def open_regular(place: Place) -> BufferedReader:
-    """Open a regular file for reading; never wait for a pipe or a device.
+    """Return a regular file, opened for reading. The function never waits for a pipe or a device.
 
     Raises
     ------
     NotRegularFileError
-        It is a pipe, a device or a directory; below a folder, a link, or a directory above it is a link.
+        The place is a pipe, a device or a directory; or, below a folder, it is a link or leads over a link.
     OSError
-        It cannot be opened.
+        The file cannot be opened.
     """
     if isinstance(place, Below):
         place.check_links()
@@ -146,7 +146,8 @@ def read_regular(place: Place, most_bytes: int = LARGEST_DOCUMENT_BYTES) -> byte
         As `open_regular`; the file is larger than `most_bytes`.
     """
     with open_regular(place) as file:
-        # the size of the file, not the limit: this is the memory that is allocated; a sparse file is refused unread
+        # read() allocates the memory that it is asked for: the size of the file, not the limit. A large sparse file is
+        # refused before it is read.
         size = os.fstat(file.fileno()).st_size
         content = file.read(size + 1) if size <= most_bytes else b""
         while max(size, len(content)) <= most_bytes and (
@@ -159,7 +160,7 @@ def read_regular(place: Place, most_bytes: int = LARGEST_DOCUMENT_BYTES) -> byte
 
 
 def is_special(path: Path) -> bool:
-    """Return whether there is a pipe or a device, whose reading may never end."""
+    """Return whether a path is a pipe or a device, whose reading may never end."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
@@ -168,10 +169,10 @@ def is_special(path: Path) -> bool:
 
 
 def is_regular(place: Place) -> bool:
-    """Return whether there is a file that `open_regular` opens."""
+    """Return whether a place is a file that `open_regular` opens."""
     try:
         open_regular(place).close()
-    except (OSError, ValueError):  # ValueError: what a stranger wrote is no path
+    except (OSError, ValueError):  # ValueError: the text is no path
         return False
     return True
 
@@ -179,8 +180,8 @@ def is_regular(place: Place) -> bool:
 class UrlPath(_LocalPath):
     """An address where the path of a log or of a result is expected.
 
-    Its text has no password and no query, where tokens and signatures stand: it is what every output shows. Only
-    `url` has them. To Python's functions on files it is a path that does not exist; nothing here opens a connection.
+    Its text, which outputs show, has no password and no query, because queries may hold tokens and signatures. Only
+    `url` has them. For Python's functions on files it is a path that does not exist. No method opens a connection.
     """
 
     _url: str
@@ -201,26 +202,26 @@ class UrlPath(_LocalPath):
 
     @property
     def scheme(self) -> str:
-        """What stands before ``://``."""
+        """The kind of the address: the text before ``://``, in lower case."""
         return _parts(self._url)[0].lower()
 
     @property
     def parent(self) -> Path:  # type: ignore[override]  # of any path
-        """The folder that it lies in."""
+        """The folder of the address."""
         return Path(*self.parts[:-1])
 
     def with_segments(self, *segments: object) -> Path:
-        """Return a path of parts of the address: a path like any other."""
+        """Return parts of the address as an ordinary path."""
         return Path(*map(str, segments))
 
     def __truediv__(self, name: object) -> Self:
-        """Return the address of what lies below it."""
+        """Return the address of a file or folder below this address."""
         behind = _parts(self._url)[3] if self.scheme.startswith("http") else ""
         place = self._url.removesuffix(behind) or self._url
         return type(self)(f"{place.rstrip('/')}/{PurePosixPath(str(name)).as_posix()}{behind}")
 
     def absolute(self) -> Self:
-        """Return itself."""
+        """Return the address itself, which has no relative form."""
         return self
 
     def __str__(self) -> str:
@@ -231,7 +232,7 @@ class UrlPath(_LocalPath):
 
     @property
     def digest(self) -> str:
-        """SHA-256 (hex) of the whole address: addresses that differ only in their queries have the same text."""
+        """SHA-256 (hex) of the whole address, because addresses that differ only in their queries have equal texts."""
         import hashlib  # here, because the help of a command does not need it
 
         return hashlib.sha256(self._url.encode("utf-8", "surrogateescape")).hexdigest()
@@ -263,14 +264,14 @@ class UrlPath(_LocalPath):
         return UrlPath, (self._url,)
 
     def exists(self, **_: bool) -> bool:
-        """Return False: it is no file of this machine."""
+        """Return False: an address is no file of this machine."""
         return False
 
     is_file = is_dir = is_symlink = exists
 
 
 def place_of(named: str | Path) -> Path:
-    """Return what a user named: an address as `UrlPath`, also one that is not written well; else a path."""
+    """Return the place that a user named: a `UrlPath` for an address, even a malformed address; else a path."""
     text = os.fspath(named)
     return UrlPath(text) if _MEANT.search(text) else Path(text)
 
@@ -288,7 +289,7 @@ def _parts(url: str) -> tuple[str, str, str, str]:
     if not mark and ":" in first and "@" in rest and not (is_web and (port.isdecimal() or first.startswith("["))):
         known, mark, shown = rest.rpartition("@")  # a password with a slash
     if "?" in known or "#" in known:
-        return scheme, "", "…", rest  # where its parts begin cannot be known
+        return scheme, "", "…", rest  # a malformed address: its parts cannot be separated
     end = min((at for sign in ("?#" if is_web else "?") if (at := shown.find(sign)) >= 0), default=len(shown))
     return scheme, known, shown[:end], shown[end:]
 
@@ -302,9 +303,9 @@ def without_secrets(url: str) -> str:
 
 
 def _secrets_of(url: str) -> list[str]:
-    """Return the parts of an address that no output shows, as they stand in it and without escapes, longest first."""
+    """Return the secret parts of an address, as written, escaped and without escapes, the longest first."""
     _, known, _, behind = _parts(url)
     whole = {one for text in (known, behind) for one in (text, unquote(text), unquote_plus(text), quote(text))}
-    # a library may cut them elsewhere
+    # a library may show pieces of the secrets
     pieces = whole | {piece for text in whole for piece in re.split(r"[^\w.~-]+", text)}
     return sorted((one for one in pieces if len(one) >= _LEAST_SECRET), key=len, reverse=True)

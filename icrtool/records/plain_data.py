@@ -12,22 +12,22 @@ import numpy as np
 
 
 class Record(msgspec.Struct, frozen=True):
-    """Part of a JSON document: read with its types checked; keys that it does not know are ignored."""
+    """Part of a JSON document. Reading checks the types of its fields, and ignores unknown keys."""
 
 
 def finite_or_none(value: float) -> float | None:
-    """Return a number, None where it is not finite."""
+    """Return a finite number; None for infinity and NaN."""
     return value if math.isfinite(value) else None
 
 
 def plain_value(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return a value as JSON gives it back: lists, dicts, text, numbers; None for what is not a finite number.
+    """Return a value as lists, dicts, texts and numbers, as JSON gives it back; None for infinity and NaN.
 
-    Of a dataclass, only fields that are compared and set are content.
+    Fields of a dataclass with ``compare=False`` and fields that are UNSET are left out.
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
-    # most values are single ones: they are tested first, because the other tests take longer
+    # Single values are tested first: most values are single, and the other tests take longer.
     if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, float):

@@ -1,4 +1,4 @@
-"""The presets of the filter: what Pentzer 2014 does, and what logs from the field need.
+"""The presets of the filter: the rules of Pentzer 2014, and the rules for logs from the field.
 
 A preset is chosen by its name in ``filter.preset``; `icrtool.config.FilterConfig.rules` gives its record.
 """
@@ -25,19 +25,19 @@ class Preset:
     Attributes
     ----------
     corrects : errors of the streams (conventions, offsets, delays, scales, gaps, slip events) are found and corrected;
-        else the streams are used as they were sent
-    measures_noise : noise is taken from the messages and from the drive; else from the configuration alone
+        False: the streams are used as they were sent
+    measures_noise : noise is taken from the messages and from the drive; False: from the configuration alone
     gates : innovations above the gate are rejected
     keeps_sides : the right ICR stays right of the robot, the left one left
-    final_of_filter : the ICRs of a run are the filter's last ones; else they come from a fit to windows of the drive
+    final_of_filter : the ICRs of a run are the filter's last ICRs; False: the ICRs of a fit to windows of the drive
     rate_invariant : process noise does not depend on the number of steps
     step_heading : share of a step's turn that is added to the heading before the step's displacement
-    process_noise : of the pose, where none is configured
-    printed_derivatives : the Jacobian has Eqs. 28-29 as printed, with the difference of Eqs. 32-34; else the true
-        derivatives. Both are the same where the right ICR is right of the left one
-    initial_icrs_m : right, left, x [m]; None: the ICRs of usual skid-steer robots of the track width
-    initial_icr_std_m : standard deviation [m]; None: the spread of the ICRs of usual robots
-    terrain_icr_std_m : of the ICRs after a change of terrain [m]; None: the track width
+    process_noise : process noise of the pose where none is configured
+    printed_derivatives : the Jacobian has Eqs. 28-29 as printed, with the difference of Eqs. 32-34; False: the true
+        derivatives. Both are equal where the right ICR is right of the left ICR
+    initial_icrs_m : initial ICRs, right, left, x [m]; None: the ICRs of usual skid-steer robots of this track width
+    initial_icr_std_m : standard deviation of the initial ICRs [m]; None: the spread of the ICRs of usual robots
+    terrain_icr_std_m : standard deviation of the ICRs after a change of terrain [m]; None: the track width
     """
 
     name: PresetName
@@ -75,7 +75,7 @@ PAPER = Preset(
     # Section 5.2: a variance of 100 m^2
     terrain_icr_std_m=10.0,
 )
-"""Pentzer 2014: the constants and the start of its Sections 5 and 6."""
+"""Preset of Pentzer 2014: constants and initial state of its Sections 5 and 6."""
 
 FIELD = Preset(
     name="field",
@@ -88,16 +88,17 @@ FIELD = Preset(
     # An Euler step drives straight on for dt, which looks like an x_icr of -v dt/2 (5 cm at 10 Hz and 1 m/s). A robot
     # that turns while its track speeds are held moves along the heading of the middle of its turn.
     step_heading=0.5,
-    # With the paper's 0.2 and 5 the 2-sigma bands hold only 83 % (position) and 86 % (heading) of the truth on
-    # rigid-body simulated robots, with these 90 % and more.
+    # On rigid-body simulated robots the 2-sigma bands hold 90 % and more of the true states with these values, and
+    # only 83 % (position) and 86 % (heading) with the paper's 0.2 m/s and 5 deg/s.
     process_noise=ProcessNoise(0.3, 7.0),
     printed_derivatives=False,
     initial_icrs_m=None,
     initial_icr_std_m=None,
-    # With 10 m a linearised filter of ICRs about 1 m apart ends with wrong ICRs on some drives.
+    # With 10 m, far more than the distance of about 1 m between the ICRs, the linearised filter ends with wrong ICRs
+    # on some drives.
     terrain_icr_std_m=None,
 )
-"""What logs from the field need: their sensors have errors, and their robots have known tracks."""
+"""Preset for logs from the field: the sensors have errors, and the track width of the robot is known."""
 
 PRESETS: dict[PresetName, Preset] = {"paper": PAPER, "field": FIELD}
 """The presets by their names."""

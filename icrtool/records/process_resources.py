@@ -1,4 +1,4 @@
-"""What a process has to clear: unfinished files, where it is ended by force, and memory that it freed."""
+"""Resources that a process releases: unfinished files when a signal ends it, and memory that it freed."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path  # its import would be a tenth of ``icrtool --help``
+    from pathlib import Path  # its import would take a tenth of the time of ``icrtool --help``
 
 TRIES = 20
-"""Attempts to remove a directory: another thread may still add files to it."""
+"""Number of attempts to remove a directory. Another thread may still add files to the directory."""
 
 _paths: set[Path] = set()
 _undisturbed: list[bool] = []
 
 
 def mark_unfinished(path: Path) -> None:
-    """Have `remove_unfinished` remove a file or directory, until `mark_finished` is called."""
+    """Add a path to the paths that `remove_unfinished` removes, until `mark_finished` is called."""
     _paths.add(path)
 
 
 def mark_finished(path: Path) -> None:
-    """Keep what is at a path from now on: it is complete, or its name is about to become another's."""
+    """Take a path from the paths that `remove_unfinished` removes: it is complete, or another file gets its name."""
     _paths.discard(path)
 
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[None]:
-    """Remove a file or directory in `remove_unfinished` until the block ends."""
+    """Mark a path as unfinished until the block ends."""
     mark_unfinished(path)
     try:
         yield
@@ -40,7 +40,10 @@ def unfinished(path: Path) -> Iterator[None]:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Let a signal end the process only after the block, which is short and makes a file under an unknown name."""
+    """Delay the end of the process by a signal until the block ends.
+
+    The block is short, and makes a file under a name that `remove_unfinished` does not know yet.
+    """
     _undisturbed.append(True)
     try:
         yield
@@ -54,7 +57,7 @@ def may_end() -> bool:
 
 
 def remove_unfinished() -> None:
-    """Remove all that is being written; called where no other code of this process will do it any more."""
+    """Remove all unfinished files and directories. It is called when no other code of this process will run."""
     for path in list(_paths):
         for _ in range(TRIES):
             remove_path(path)
@@ -63,7 +66,7 @@ def remove_unfinished() -> None:
 
 
 def remove_path(path: Path) -> None:
-    """Remove a file or a directory, as far as that is possible."""
+    """Remove a file or a directory; files that cannot be removed stay."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -72,26 +75,27 @@ def remove_path(path: Path) -> None:
 
 
 LARGE_BYTES = 600 << 20
-"""Memory below which a process does not give freed memory back [bytes]: logs of up to an hour take less, and the gain
-would not matter."""
+"""Memory use below which a process keeps its freed memory [bytes]. A log of up to 1 h needs less memory."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
-"""Of glibc's ``malloc.h``."""
+"""Numbers of parameters of ``mallopt``, from glibc's ``malloc.h``."""
 
 KEPT_BYTES = 1 << 27
-"""Largest free end of the memory that glibc keeps [bytes]."""
+"""Largest size of the free memory at the end of the heap that glibc keeps [bytes]."""
 
 OWN_PAGES_BYTES = 1 << 22
-"""Size from which on glibc gives an array pages of its own, which are given back with it [bytes]. A column of 1 h at
-100 Hz has 2.9 MB: it uses memory again. Columns of longer logs are given back without a call of `give_back_freed`. The
-pipeline calls it at each stage: without these calls a report on 10 h took 1168 MB in place of 958 MB."""
+"""Smallest array to which glibc gives pages of its own [bytes]; these pages go back to the system with the array.
+
+A column of 1 h at 100 Hz has 2.9 MB: its memory is used again. The pages of longer columns go back without a call of
+`give_back_freed`. The pipeline calls `give_back_freed` at each stage; without these calls a report on 10 h took 1168 MB
+in place of 958 MB."""
 
 
 def keep_freed() -> None:
-    """Let new threads allocate in the main thread's memory, and use memory again that other threads freed.
+    """Set glibc to allocate for all threads in one arena, and to use freed memory again.
 
-    glibc gives each thread an arena of its own, whose free end `malloc_trim` does not give back; and glibc gives the
-    memory of a column of 1 h back and requests it again for the next column: half of all pages of a fit.
+    By default each thread has an arena, whose free end `malloc_trim` does not give back. Also by default, glibc gives
+    the memory of a column of 1 h back and requests it again for the next column: half of all pages of a fit.
     """
     _call_libc("mallopt", M_ARENA_MAX, 1)
     _call_libc("mallopt", M_TRIM_THRESHOLD, KEPT_BYTES)
@@ -99,7 +103,7 @@ def keep_freed() -> None:
 
 
 def give_back_freed() -> None:
-    """Have the C library give freed memory back.
+    """Give freed memory back to the system.
 
     glibc keeps freed blocks of up to 32 MB, in pieces that are too small for another column of a long log: 0.3 GB after
     reading 10 h at 100 Hz.
@@ -112,7 +116,7 @@ def give_back_freed() -> None:
 
 
 def _call_libc(name: str, *arguments: int) -> None:
-    """Call a function of the C library; other systems, and musl, have none of that name."""
+    """Call a function of glibc; do nothing on systems without this function (musl, macOS, Windows)."""
     if sys.platform == "linux":
         import ctypes
 

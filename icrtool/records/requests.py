@@ -1,4 +1,4 @@
-"""What is asked of a fit, of a dropout report and of a batch: one record for each question.
+"""The requests for a fit, for a dropout report and for a batch: one record for each question.
 
 The command line makes a request from its options, a public function makes it from its keyword arguments. The code that
 acts on a request gets it unchanged, and run.json or report.json holds it as ``request``. A request holds words and
@@ -23,12 +23,14 @@ from icrtool.records.plain_data import Record
 
 
 class FitRequest(Record, frozen=True, kw_only=True):
-    """What is asked of a fit.
+    """Request for a fit.
 
     Attributes
     ----------
-    start, end : from when to when the log is read, as in `icrtool.read_log`; None: from its begin, to its end
-    changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
+    start, end : begin and end of the part of the log that is read, as in `icrtool.read_log`; None: begin and end of the
+        log
+    changes_s : times of terrain changes since the first recorded state [s]; the ICR covariance is inflated at these
+        times (Fig. 9)
     smooth : also make the states of the RTS smoother
     """
 
@@ -39,28 +41,30 @@ class FitRequest(Record, frozen=True, kw_only=True):
 
 
 class ReportRequest(Record, frozen=True, kw_only=True):
-    """What is asked of a dropout report.
+    """Request for a dropout report.
 
     Attributes
     ----------
     horizons_m : distances without GNSS [m]; None: the configured ones. Horizons of `gates` are added
-    budgets_m : for each, the distance over which 95 % of the trials stay within it [m]
+    budgets_m : budgets of the position error [m]. For each budget the report states the distance over which 95 % of
+        the trials stay within the budget
     gates : acceptance limits, for example ``icr.p95@10m <= 3.8``
     strict_gates : limits relative to a baseline are compared by the number alone, without the confidence interval of
         the difference
-    allow_unusable : a run that is not usable is reported on like any other. Else its report has the rows of the filter
-        and of no slip alone and no distance, and every limit fails
+    allow_unusable : the report on an unusable run has all rows and distances. False: the report has only the rows of
+        the filter and of no slip, no distance, and every limit fails
     outage_s : lengths of outages to force on the filter [s]; None: the configured ones
-    outage_at_s : their begins, seconds since the first state; empty: spaced over the time in which the robot moves
+    outage_at_s : begins of the forced outages since the first state [s]; empty: outages are spaced over the time in
+        which the robot moves
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
-    reference : what trials are compared with: the states of the filter or of the smoother
+    reference : states that trials are compared with: of the filter or of the smoother
     without_events : trials that cross a slip event are left out
     with_jumps : trials that cross a jump of the reference are counted too, and models are fitted across it
-    refit_sensors : heading offset, delays and gyro bias of calibrations that are given are refitted in this log, in
-        place of those that the calibrations hold
+    refit_sensors : heading offset, delays and gyro bias of the given calibrations are replaced by values that are
+        fitted to this log
     ladder : all models are also tested on distance that they were not fitted to
-    score : topics of poses in the log, each compared with the reference as a row ``topic:NAME``
-    seed : of the random draws
+    score : topics with poses in the log; each topic is compared with the reference, as the row ``topic:NAME``
+    seed : seed of the random draws
     """
 
     horizons_m: tuple[float, ...] | None = None
@@ -81,7 +85,7 @@ class ReportRequest(Record, frozen=True, kw_only=True):
 
     @property
     def fit(self) -> FitRequest:
-        """What is asked of a fit whose run shall have such a report."""
+        """The request for the fit of a run that this report can be made of."""
         return FitRequest(smooth=self.reference == "smoothed")
 
     def configured(self, config: Config) -> ReportRequest:
@@ -95,12 +99,12 @@ class ReportRequest(Record, frozen=True, kw_only=True):
 
 
 class ResultFiles(Record, frozen=True, kw_only=True):
-    """In which files a run and its report are written.
+    """The files that a run and its report are written to.
 
     Attributes
     ----------
     overwrite : the run of another recording may be replaced
-    plots, figures, states : as in `icrtool.output.run_directory.new_run`
+    plots, figures, states : formats, as in `icrtool.output.run_directory.new_run`
     trials : every single trial is written to trials.parquet
     page : report.html is written
     """
@@ -115,14 +119,14 @@ class ResultFiles(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class BatchRequest:
-    """What is asked of a batch.
+    """Request for a batch.
 
     Attributes
     ----------
-    settings : a manifest's line comes before its file and robot
-    report, files : of every log
+    settings : sources of the configuration; the line of a manifest comes before the file and the robot in `settings`
+    report, files : request and files of the report on every log
     redo : logs that are done are processed again
-    timeout_s : longest time of a log [s]; a longer process is ended
+    timeout_s : longest time of the work on a log [s]; the process is ended after this time
     calibrations : files of calibrations, each of which becomes a row of every report
     baseline : earlier report, run or batch to compare with
     """
@@ -144,13 +148,15 @@ class CalibrationInput(Record, frozen=True):
 
 
 class LogRequest(Record, frozen=True, kw_only=True):
-    """What a batch asks of one log; travels to the process that does it as JSON. Paths are bytes: of any name.
+    """Request of a batch for one log. It is sent as JSON to the process that works on the log.
+
+    Paths are bytes, because names of files need not be text.
 
     Attributes
     ----------
-    path : of the log
-    known : the fields of its row that are known before the fit
-    folder : of the batch
+    path : path of the log
+    known : the row of the log, with the fields that are known before the fit
+    folder : folder of the batch
     calibrations : each becomes a row of the report
     baseline : place of an earlier report or batch to compare with; empty: none
     """
@@ -166,19 +172,19 @@ class LogRequest(Record, frozen=True, kw_only=True):
 
     @property
     def row_file(self) -> str:
-        """Where the row is written, below the folder, for a batch that continues this one."""
+        """Path of the file with the row, below the folder; a batch that continues this batch reads it."""
         name = self.known.run.removeprefix(f"{RUNS}/")
         return f"{ROWS}/{blake2b(os.fsencode(name), digest_size=16).hexdigest()}.json"
 
     def encode(self) -> bytes:
-        """Return it as one line of JSON."""
+        """Return the request as one line of JSON."""
         return msgspec.json.encode(self)
 
 
 _LOG_REQUEST = msgspec.json.Decoder(LogRequest)
-"""Made at import: msgspec crashes where several threads are the first to use a type."""
+"""Decoder of requests, made at import, because msgspec crashes if several threads use a type for the first time."""
 
 
 def decode_request(line: bytes) -> LogRequest:
-    """Return what `LogRequest.encode` wrote."""
+    """Return the request in a line that `LogRequest.encode` wrote."""
     return _LOG_REQUEST.decode(line)

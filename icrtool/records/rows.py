@@ -1,6 +1,7 @@
 """The rows of a dropout report: the one table of their names, words, order, looks and places.
 
-A row is named as in the files, everywhere. A new row is an entry here, the code that computes it, and a test.
+A row has the same name in files, messages and pages. A new row needs an entry here, the code that computes it, and a
+test.
 """
 
 from __future__ import annotations
@@ -12,36 +13,36 @@ from typing import Literal
 from icrtool.kernels.error_statistics import Spread
 
 Color = Literal["green", "purple", "blue", "orange", "grey", "brown", "pink", "teal", "olive", "slate"]
-"""Name of a colour; `icrtool.output.figures.style` and page.css state its value on paper and on a screen."""
+"""Name of a colour. `icrtool.output.figures.style` has its value on paper, page.css its value on a screen."""
 
 Dash = Literal["solid", "dashed", "dotted", "dashdot"]
 
 TURNED_BY = ("gyro", "heading")
-"""Sensors that a row can take its turns from in place of the wheels; its name ends with the sensor: ``icr_gyro``."""
+"""Sensors that can replace the turns of the wheels in a row. The name of the row ends with the sensor: ``icr_gyro``."""
 
 REST_OF_DRIVE = "the rest of the drive"
-"""In `knows`: the row is tested on distance that its numbers were not fitted to."""
+"""Value of `knows`: the row is tested on distance that its parameters were not fitted to."""
 
 WHOLE_DRIVE = "the whole drive, its trials too"
 
 PAST = "the drive before each start"
-"""In `knows`: the numbers of the row were learned before each trial begins."""
+"""Value of `knows`: the parameters of the row were learned before each trial begins."""
 
 INSTALLATION = "sensors corrected by all of the drive"
-"""In `knows`: conventions, heading offset, delays, scales and sensor noise come from all of the drive."""
+"""Value of `knows`: conventions, heading offset, delays, scales and sensor noise come from all of the drive."""
 
 
 FITTED_SPREAD = Spread(shift=0.3, between=0.45, horizon_std=1.0, grounds=0.7)
-"""Spread of p95 between drives, of rows whose numbers were fitted to the drive and turn by the wheels."""
+"""Spread of p95 between drives for rows that turn by the wheels and whose parameters were fitted to the drive."""
 
 GIVEN_SPREAD = Spread(shift=0.0, between=0.45, horizon_std=0.95, grounds=0.55)
-"""Spread of p95 between drives, of rows that learn while they drive, and of calibrations that are held."""
+"""Spread of p95 between drives for rows that learn during the drive, and for calibrations."""
 
 UNFITTED_SPREAD = Spread(shift=0.0, between=0.15, horizon_std=0.5, grounds=0.2)
-"""Spread of p95 between drives, of rows whose numbers never change: their error is the slip itself."""
+"""Spread of p95 between drives for rows with constant parameters, whose error is the slip of the robot."""
 
 TURNED_SPREAD = Spread(shift=0.0, between=0.15, horizon_std=0.75, grounds=0.3)
-"""Spread of p95 between drives, of rows that turn by a gyro or a measured heading."""
+"""Spread of p95 between drives for rows that turn by a gyro or a measured heading."""
 
 TOPIC_ROW = "topic"
 """Kind of the rows that stand for a topic of the log."""
@@ -53,18 +54,19 @@ class Row:
 
     Attributes
     ----------
-    name : as in summary.csv, in limits and in every output
+    name : name of the row in summary.csv, in limits and in every output
     words : what predicts the motion, in a few words
-    knows : what its numbers were learned from
-    color, dash, width : its line, in pictures and on pages; most lines have width 1
-    shown : stands in the first table and is drawn on a page from the start; the others need a click or ``-v``
-    pictured : drawn in pictures, and its path is computed for single trials
-    in_csv : has a column in tables with one column for each row of the report: worst.csv, the page of a batch
-    on_robot : a user can run it on a robot; the others analyse a log
-    compared : stands for comparison: a thin line without interval, drawn with every other row in pictures of paths
+    knows : the data that the parameters were learned from
+    color, dash, width : line of the row in pictures and on pages; most lines have width 1
+    shown : the row is in the first table and is drawn on a page at first; other rows need a click or ``-v``
+    pictured : the row is drawn in pictures, and its path is computed for single trials
+    in_csv : the row has a column in tables with one column for each row of the report: worst.csv, the page of a batch
+    on_robot : a user can run the model on a robot; other rows only analyse a log
+    compared : the row serves for comparison: a thin line without interval, drawn with every other row in pictures of
+        paths
     turned_shown : `shown` of the row with a gyro or heading
     turned_knows : `knows` of the row with a gyro or heading
-    spread : how its p95 differs between drives of one robot on one kind of ground
+    spread : spread of the row's p95 between drives of one robot on one kind of ground
     """
 
     name: str
@@ -128,10 +130,10 @@ REPORT_ROWS: dict[str, Row] = {
 ``topic:/its/name`` a row of kind ``topic``."""
 
 MAIN_ROW, FALLBACK_ROW = "recommended", "icr"
-"""The row that stands for a log, and the row in its place where a report has no held-out rows."""
+"""Name of the row that represents a log, and of the row that replaces it in a report without held-out rows."""
 
 LONGEST_ROW_NAME = 28
-"""Characters of a row's name in tables and titles; the middle of a longer name is left out."""
+"""Largest length of a row's name in tables and titles [characters]; the middle of a longer name is left out."""
 
 FURTHER_LOOKS: tuple[tuple[Color, Dash], ...] = (
     ("teal", "dashdot"), ("olive", "dashed"), ("slate", "solid"), ("teal", "dotted"), ("olive", "solid"),
@@ -141,9 +143,9 @@ FURTHER_LOOKS: tuple[tuple[Color, Dash], ...] = (
 
 
 def turned_by(name: str) -> str:
-    """Return ``gyro`` or ``heading`` where a row turns by it, empty where it turns by the wheels alone.
+    """Return the sensor that a row turns by, ``gyro`` or ``heading``; empty where it turns by the wheels alone.
 
-    A topic's row has the topic's name, whatever that ends in.
+    The row of a topic turns by no sensor, even if the name of the topic ends with a sensor.
     """
     if name.startswith(f"{TOPIC_ROW}:"):
         return ""
@@ -151,7 +153,7 @@ def turned_by(name: str) -> str:
 
 
 def base_of(name: str) -> str:
-    """Return the name of a row without what it turns by."""
+    """Return the name of a row without the sensor at its end."""
     by = turned_by(name)
     return name.removesuffix(f"_{by}") if by else name
 
@@ -162,7 +164,7 @@ def kind_of(name: str) -> str:
 
 
 def row_of(name: str) -> Row:
-    """Return the row of a name, also of one with a gyro, of one of several calibrations, and of a caller's model."""
+    """Return the row with a name: an entry, also with a gyro or heading; a calibration; a topic; a caller's model."""
     row = replace(REPORT_ROWS.get(kind_of(name)) or Row(name, "given by the caller", "not known"), name=name)
     if not (by := turned_by(name)):
         return row
@@ -173,7 +175,7 @@ def row_of(name: str) -> Row:
 
 
 def rows_of(names: Iterable[str]) -> dict[str, Row]:
-    """Return rows by name in the order in which they are shown; rows of one kind have looks in turn."""
+    """Return rows by name in the order in which they are shown; rows of one kind get different colours and dashes."""
     places = {kind: place for place, kind in enumerate(REPORT_ROWS)}
     unique_names = list(dict.fromkeys(names))
     bases = list(dict.fromkeys(map(base_of, unique_names)))
@@ -198,7 +200,7 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def shown_rows(names: Sequence[str]) -> list[str]:
-    """Return the names of the rows that are shown first, in order: `FALLBACK_ROW` too where `MAIN_ROW` is missing."""
+    """Return the names of the rows that are shown first, in order; with `FALLBACK_ROW` where `MAIN_ROW` is missing."""
     instead = () if MAIN_ROW in names else (FALLBACK_ROW,)
     return [name for name, row in rows_of(names).items() if row.shown or name in instead]
 

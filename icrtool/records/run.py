@@ -1,4 +1,4 @@
-"""A run: what the filter made of a log. The same record whether it was just made or read back from its directory."""
+"""A run: the result of the filter on a log. A run read from its directory is equal to the run that was written."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ ICR_COLUMNS: tuple[IcrColumn, ...] = ("y_icr_right_m", "y_icr_left_m", "x_icr_m"
 ICR_WORDS: dict[str, str] = dict(zip(ICR_COLUMNS, ("y right", "y left", "x"), strict=True))
 
 STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
-"""The state's entries, in the kernel's order."""
+"""Columns of the entries of the state, in the order of the kernels."""
 
 ROLLING_SCALE = 0.15
-"""Tyres and soil change the distance of a turn of the wheel by up to this share."""
+"""Largest share by which tyres and soil change the distance of a wheel revolution."""
 
 USUAL_WIDTH_M = 0.6
 """Track width of a small field robot [m], used where the robot's track width is not known."""
 
 MAKE_RUN = "icrtool.fit(log) makes one, icrtool.open_run(directory) reads one"
-"""Advice where something else than a run is given."""
+"""Advice in the error about an argument that is not a run."""
 
 
 def check_type(value: object, kind: type, advice: str) -> None:
-    """Refuse an argument of another type, as the path of a file.
+    """Refuse an argument of another type, for example the path of a file.
 
     Raises
     ------
     TypeError
-        It is; `advice` names what to call.
+        The argument has another type; `advice` names the function to call.
     """
     if not isinstance(value, kind):
         raise TypeError(f"a {kind.__name__} is needed, not {type(value).__name__}; {advice}")
@@ -60,8 +60,9 @@ class MeasurementOutcome:
 
     Attributes
     ----------
-    stamp_ns : int64 (m,); start_ns : of the first recorded state
-    nis : (m,) normalised innovation squared, NaN where unseen
+    stamp_ns : int64 (m,)
+    start_ns : stamp of the first recorded state
+    nis : (m,) normalised innovation squared, NaN where the filter did not see the measurement
     code : uint8 (m,), see `icrtool.kernels.filter_records`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
     """
@@ -79,13 +80,13 @@ class MeasurementOutcome:
 
     @property
     def used(self) -> Bools:
-        """Which measurements moved the filter (m,)."""
+        """Whether the filter was updated with each measurement (m,)."""
         moved: Bools = (self.code == USED) | (self.code == RECOVERED)
         return moved
 
     @property
     def rejected(self) -> Bools:
-        """Which measurements the innovation gate rejected (m,)."""
+        """Whether the innovation gate rejected each measurement (m,)."""
         gated: Bools = self.code == GATED
         return gated
 
@@ -94,8 +95,8 @@ class MeasurementOutcome:
 class WarmStart:
     """ICRs (3,) [m], right, left, x, and their covariance (3, 3) [m^2] to start from (Pentzer 2014, Fig. 18).
 
-    `track_width_m` is b of the robot they were learned on, None where it was not given; `source` the name of the run or
-    file that they come from, empty where it has none.
+    `track_width_m` is b of the robot that the ICRs were learned on, None where it was not given. `source` is the name
+    of the run or file that the ICRs come from, empty without a name.
     """
 
     icrs_m: Floats
@@ -106,18 +107,18 @@ class WarmStart:
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
 class Run:
-    """One finished run; `icrtool.fit` makes it, `icrtool.open_run` reads it back equal.
+    """One finished run. `icrtool.fit` makes a run, `icrtool.open_run` reads an equal run from its directory.
 
     Attributes
     ----------
-    document : what run.json holds
+    document : content of run.json
     table : the recorded states; `states` is the same as a DataFrame
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
     outages_ns : half-open spans without usable GNSS, (k, 2)
     sensors : the streams as the filter used them
     gnss, heading : how the filter used each fix and heading
     smoothed : states of the RTS smoother at the same stamps, None where they were not asked for
-    directory : where it was read from, None for one just made
+    directory : directory that the run was read from, None for a run that was just made
     """
 
     document: RunDocument
@@ -165,18 +166,18 @@ class Run:
 
     @property
     def config(self) -> Config:
-        """The configuration it was made with."""
+        """The configuration that the run was made with."""
         return self.document.config
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What run.json holds, as plain data."""
+        """The content of run.json, as plain data."""
         content: dict[str, Any] = plain_value(self.document)
         return content
 
     @property
     def notes(self) -> tuple[Note, ...]:
-        """What was found, in order: each with a code, a grade and a text."""
+        """The findings in the order in which they were made; each has a code, a grade and a text."""
         return self.document.notes
 
     @property
@@ -186,12 +187,12 @@ class Run:
 
     @property
     def track_width_m(self) -> float | None:
-        """Distance b between the track centre lines, None where not given."""
+        """Distance b between the centre lines of the tracks [m], None where it was not given."""
         return self.config.robot.track_width_m
 
     @property
     def changes_s(self) -> tuple[float, ...]:
-        """Terrain changes, seconds since the first recorded state."""
+        """Times of the terrain changes since the first recorded state [s]."""
         return tuple(change.t_s for change in self.document.terrain.changes)
 
     @property
@@ -201,24 +202,24 @@ class Run:
 
     @property
     def jumping(self) -> Bools:
-        """Whether the reference jumps in the interval after a state, and that is not what the robot did (n,)."""
+        """Whether the reference jumps in the interval after a state (n,); undecided jumps do not count."""
         decided = (jump for jump in self.sensors.jumps if not jump.undecided)
         return intervals_in(self.table.stamp_ns, ((jump.begin_ns, jump.end_ns) for jump in decided))
 
     @property
     def convergence_s(self) -> dict[IcrColumn, tuple[float, float] | None]:
-        """By ICR column, first and last second of the 10-90 % convergence, or None."""
+        """Begin and end of the 10-90 % convergence [s] by ICR column; None without convergence."""
         spans = self.document.icr.convergence_span_s
         return {name: spans[name] for name in ICR_COLUMNS}
 
     @property
     def settled_s(self) -> float:
-        """When the last ICR had converged, seconds since the first recorded state; 0 where none did."""
+        """Time at which the last ICR had converged, since the first recorded state [s]; 0 where no ICR converged."""
         return max((span[1] for span in self.convergence_s.values() if span is not None), default=0.0)
 
     @property
     def began_with(self) -> WarmStart | None:
-        """What the run was warm-started with, None where it was not."""
+        """The warm start of the run, None for a run without a warm start."""
         stored = self.document.filter.warm_start
         if stored is None:
             return None
@@ -226,15 +227,16 @@ class Run:
 
     @property
     def ended_with(self) -> WarmStart:
-        """The filter's last ICRs and their covariance, to start another run from; large where not shown."""
+        """Warm start for another run: the filter's last ICRs and their covariance, large where an ICR is not shown."""
         covariance = np.array(self.document.icr.final_covariance_m2, np.float64)
         return WarmStart(np.array(self.table.icrs_at(-1)), covariance, self.track_width_m, self.name)
 
     @property
     def wheel_scales(self) -> tuple[float, float]:
-        """Factors, left and right, from the speeds at the nominal wheel radius to the recorded ones.
+        """Ratios of the recorded speeds to the speeds at the nominal wheel radius, left and right.
 
-        They include configured and estimated scales; speeds divided by them are the speeds that the wheels reported.
+        The ratios include configured and estimated scales. A recorded speed divided by its ratio is the speed that the
+        wheels reported.
         """
         return self.document.wheels.applied_left_scale, self.document.wheels.applied_right_scale
 
@@ -242,8 +244,8 @@ class Run:
     def radius_errors(self) -> tuple[float, float]:
         """Factors of `wheel_scales`, left and right, that correct a wrong radius or resolution, not tyres and soil.
 
-        Scales of tyres and soil are within `ROLLING_SCALE` of 1, and no error. Motion models are fitted to speeds with
-        these factors, and estimate the rest: their prior is of wheels that roll near their radius.
+        Scales within `ROLLING_SCALE` of 1 come from tyres and soil, and are no error of the radius. Motion models are
+        fitted to speeds with the factors of this function, and estimate the scales of tyres and soil.
         """
         left, right = (
             1.0 if not one or abs(abs(one) - 1.0) <= ROLLING_SCALE else abs(one) for one in self.wheel_scales
@@ -263,11 +265,11 @@ class Run:
         plots: tuple[str, ...] = ("png",),
         figures: FigureSet = "default",
     ) -> None:
-        """Write the run directory, whole or not at all; an older run at `path` is replaced.
+        """Write the run directory, whole or not at all, in place of an older run at `path`.
 
         Parameters
         ----------
-        path : the directory
+        path : the run directory
         states : format of the states; default: ``csv``, or ``parquet`` for over a million states
         plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
         figures : ``all``: the figures of the paper too
@@ -301,12 +303,12 @@ class Run:
 
 
 def icr_text(value: float | None, std: float | None) -> str:
-    """Return an ICR with its standard deviation, ``not shown`` where there is none."""
+    """Return an ICR with its standard deviation as text; ``not shown`` for an ICR that is not shown."""
     return f"{value:+z.3f} ± {std:.3f}" if value is not None else "not shown"
 
 
 def width_or_usual_m(track_width_m: float | None) -> float:
-    """Return the track width b [m], `USUAL_WIDTH_M` where it is not known."""
+    """Return the track width b [m]; `USUAL_WIDTH_M` where the track width is not known."""
     return track_width_m if track_width_m is not None else USUAL_WIDTH_M
 
 
@@ -316,7 +318,7 @@ def no_slip_icrs(track_width_m: float) -> Icrs:
 
 
 def why_no_vendor(document: RunDocument) -> str:
-    """Return why a run has no row ``vendor``; empty where it has one."""
+    """Return why a run has no row ``vendor``; empty where it has this row."""
     robot = document.config.robot
     if robot.skid_factor is None:
         return "no skid factor is published for the robot (robot.skid_factor)"
@@ -344,20 +346,20 @@ def vendor_icrs(document: RunDocument) -> Icrs | None:
 
 
 def track_of(run: Run) -> Track:
-    """Return the states of a run as a track, in which no trial crosses a gap or a state that it left uncertain."""
+    """Return the states of a run as a track; no trial crosses a gap or the uncertain states after a gap."""
     unknown = run.in_gap | _unrecovered(run.table, run.in_gap)
     return track_of_states(run.table, unknown, run.outages_ns, jumping=run.jumping, slipping=run.slipping)
 
 
 RECOVERED_RATIO = 2.0
-"""Ratio of a state's standard deviation to the usual one of the run, at most which the filter has recovered from a gap
-in the wheel data."""
+"""Largest ratio of a state's standard deviation to the usual standard deviation of the run at which the filter has
+recovered from a gap in the wheel data."""
 
 
 def _unrecovered(table: States, in_gap: Bools) -> Bools:
-    """Return which states (n,) follow a gap in the wheel data and are not known again as well as usual.
+    """Return whether each state (n,) follows a gap in the wheel data and is still more uncertain than usual.
 
-    Until the first fix and the first heading after a gap a state is as uncertain as the motion in the gap.
+    The motion in a gap is not known: states stay uncertain until the first fix and the first heading after the gap.
     """
     uncertain = np.zeros(len(table), np.bool_)
     if not in_gap.any():
@@ -375,7 +377,7 @@ def _unrecovered(table: States, in_gap: Bools) -> Bools:
 def track_of_states(
     table: States, in_gap: Bools, outages_ns: Ints, *, jumping: Bools | None = None, slipping: Bools | None = None
 ) -> Track:
-    """Return states as a track; `jumping` and `slipping` as in `Run`, None where there are none."""
+    """Return states as a track; `jumping` and `slipping` as in `Run`, None without jumps or slip events."""
     in_outage = np.zeros(len(table), np.bool_)
     for begin, end in outages_ns:
         # The last fix is still good at `begin`, and the first one again at `end`.

@@ -1,4 +1,4 @@
-"""run.json: what a run holds in addition to its columns. `icrtool.fit` makes this record.
+"""Records of run.json, the content of a run in addition to its columns. `icrtool.fit` makes them.
 
 A key that a later version adds has a default, so that older runs can still be read.
 """
@@ -29,7 +29,7 @@ from icrtool.records.requests import FitRequest
 from icrtool.records.samples import InputFile, StreamChoice
 
 RUN_SCHEMA: Literal["icrtool/run/1"] = "icrtool/run/1"
-"""Version of what run.json holds."""
+"""Version of the content of run.json."""
 
 Excited = Literal["shown", "weak", "not shown"]
 IcrColumn = Literal["y_icr_right_m", "y_icr_left_m", "x_icr_m"]
@@ -40,19 +40,19 @@ Matrix = Annotated[list[Annotated[list[float], Three]], Three]
 
 
 def check_together(record: object, *names: str) -> None:
-    """Refuse a record of which only some of the named numbers are known.
+    """Refuse a record in which some of the named numbers are None and others are not.
 
     Raises
     ------
     ValueError
-        It is one.
+        Only some of the numbers are known.
     """
     if len({getattr(record, name) is None for name in names}) > 1:
         raise ValueError(f"only some of {', '.join(names)} are known")
 
 
 def known_content(content: Iterable[str | None]) -> tuple[str, ...]:
-    """Return the SHA-256 of the files of a log; none where one is not known."""
+    """Return the SHA-256 of the files of a log; empty if the SHA-256 of any file is not known."""
     digests = tuple(content)
     return () if None in digests else tuple(map(str, digests))
 
@@ -70,7 +70,7 @@ class ByIcr(Record, Generic[Value], frozen=True):
 
 
 class NumberByIcr(ByIcr[float | None], frozen=True):
-    """A number of each ICR, null where there is none."""
+    """A number of each ICR, null where the ICR has no number."""
 
 
 class SpanByIcr(ByIcr[tuple[float, float] | None], frozen=True):
@@ -82,7 +82,7 @@ class VerdictByIcr(ByIcr[Excited], frozen=True):
 
     @property
     def all_shown(self) -> bool:
-        """Whether each of the three is."""
+        """Whether all three ICRs are shown."""
         return self == VerdictByIcr("shown", "shown", "shown")
 
     @property
@@ -108,7 +108,8 @@ class DriveDocument(Record, frozen=True):
 class IcrDocument(Record, frozen=True, kw_only=True):
     """The ICRs and how they converged; null where not shown.
 
-    `mean`, `std`: over the states after convergence; `x_clock_std_m`: part of the clocks in the deviation of x.
+    `mean` and `std` are taken over the states after convergence. `x_clock_std_m` is the part of the standard deviation
+    of x that comes from the clocks [m].
     """
 
     final: NumberByIcr
@@ -130,12 +131,12 @@ class IcrDocument(Record, frozen=True, kw_only=True):
 
 
 class PathErrorDocument(Record, frozen=True):
-    """How far an odometry of the whole drive is from the filter's position.
+    """Errors of an odometry of the whole drive: distances from the position by the filter.
 
     Attributes
     ----------
-    end_error_m : at the last state
-    mean_error_m, max_error_m : over all states; missing in runs of earlier versions
+    end_error_m : error at the last state [m]
+    mean_error_m, max_error_m : mean and largest error over all states [m]; missing in runs of earlier versions
     """
 
     end_error_m: float
@@ -148,9 +149,10 @@ class OdometryDocument(Record, frozen=True):
 
     Attributes
     ----------
-    icr : with the final ICRs
-    icr_momentary : with the ICRs that the filter had estimated at each state; missing in runs of earlier versions
-    no_slip : None where the track width is not known
+    icr : errors with the final ICRs
+    icr_momentary : errors with the ICRs that the filter had estimated at each state; missing in runs of earlier
+        versions
+    no_slip : errors without slip; None where the track width is not known
     """
 
     icr: PathErrorDocument
@@ -206,7 +208,7 @@ class ReferenceJumpDocument(ReferenceJump, frozen=True):
 
 
 class ClassDocument(Record, frozen=True, kw_only=True):
-    """The fixes of one class; `std_m`: median of what they state, `step_std_m`: white noise from step to step."""
+    """The fixes of one class. `std_m`: median of the stated values; `step_std_m`: white noise from step to step [m]."""
 
     fixes: int
     used: int
@@ -238,7 +240,7 @@ class GnssDocument(Record, frozen=True):
 
 
 class HeadingDocument(HeadingFacts, frozen=True, kw_only=True):
-    """The heading: what the alignment found, and how the filter used it."""
+    """The heading: findings of the alignment, and its use by the filter."""
 
     delay_s: float | None
     delay_std_s: float | None
@@ -252,7 +254,7 @@ class HeadingDocument(HeadingFacts, frozen=True, kw_only=True):
 
 
 class WarmStartDocument(Record, frozen=True):
-    """What a run began with; `source`: the name of the run or file, empty where it is not known."""
+    """The warm start of a run. `source` is the name of the run or file it comes from, empty where it is not known."""
 
     icrs_m: Annotated[list[float], Three]
     covariance_m2: Matrix
@@ -260,7 +262,7 @@ class WarmStartDocument(Record, frozen=True):
 
 
 class FilterDocument(Record, frozen=True, kw_only=True):
-    """What the filter was run with, and the statistics of its innovations; see `icrtool.records.measurements`."""
+    """Settings of the filter and statistics of its innovations; see `icrtool.records.measurements`."""
 
     preset: str
     process_position_mps: float
@@ -276,13 +278,13 @@ class FilterDocument(Record, frozen=True, kw_only=True):
 
 
 class ExcitationDocument(Record, frozen=True):
-    """What the drive could show of the ICRs.
+    """The information of a drive about the ICRs.
 
     Attributes
     ----------
-    std_m : least standard deviation by the drive's information (Cramer-Rao bound, constant ICRs, some slip)
-    turned_right_deg, turned_left_deg : sums of the heading changes to each side; spun_*: their part on the spot
-    notes : the verdict in words, and what to drive next; empty where all is shown
+    std_m : smallest possible standard deviations of the ICRs (Cramer-Rao bound, constant ICRs, some slip) [m]
+    turned_right_deg, turned_left_deg : sums of the heading changes to each side; spun_*: the part on the spot
+    notes : the verdict in words, and what to drive next; empty where all ICRs are shown
     """
 
     std_m: NumberByIcr
@@ -303,12 +305,12 @@ class ParameterDocument(Record, frozen=True):
 
 
 class ControllerNumbers(Record, frozen=True):
-    """What a differential-drive controller is given, with one standard deviation each.
+    """Numbers for a differential-drive controller, each with one standard deviation.
 
     Attributes
     ----------
     multiplier : (y_r - y_l) / b, used together with the radius factors
-    left_radius, right_radius : wheel radius over the configured one, configured scales included
+    left_radius, right_radius : ratio of wheel radius to configured radius, configured scales included
     multiplier_between_std, radius_between_std : standard deviation between drives of one robot on one kind of ground,
         in addition to the uncertainty of one drive
     """
@@ -351,7 +353,7 @@ class GeometryDocument(Record, frozen=True, kw_only=True):
 
 
 class RecommendedDocument(Record, frozen=True):
-    """The motion model fitted for one robot: parameters with covariance, ICRs, and what a controller is given."""
+    """The motion model fitted for one robot: parameters with covariance, ICRs, and numbers for a controller."""
 
     label: str
     model: str
@@ -370,8 +372,8 @@ class RunDocument(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     notes : all findings; the grave ones make `unusable_because`, the others are the sentences of `warnings`
-    recommended, geometry, controller : the robot's motion, of a run that `icrtool.fit` made
-    partly_because : which numbers of a usable run are not shown; None where all are, and of a run that is not usable
+    recommended, geometry, controller : motion model of the robot; only a run that `icrtool.fit` made has them
+    partly_because : the numbers of a usable run that are not shown; None where all are shown, and in an unusable run
     """
 
     schema: Literal["icrtool/run/1"]
@@ -413,7 +415,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
 
     @property
     def content(self) -> tuple[str, ...]:
-        """SHA-256 of each file of the log; empty where one is not known: copies of the log are then not recognised."""
+        """SHA-256 of each file of the log. Empty if any is not known: copies of the log are then not recognised."""
         return known_content(file.sha256 for file in self.inputs)
 
     def icr_of_drive(self, column: IcrColumn) -> tuple[float, float] | None:

@@ -19,8 +19,8 @@ ROLE_WORDS: dict[Role, str] = {"wheels": "wheels", "gnss": "position", "heading"
 
 
 NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
-"""How a message states that its position was solved: not stated, without carrier phase (or unknown), RTK float, RTK
-fixed, RTK fixed or float."""
+"""Kinds of fixes by the message. In order: not stated; without carrier phase, or unknown; RTK float; RTK fixed; RTK,
+fixed or float."""
 
 
 class Samples:
@@ -36,7 +36,7 @@ class Samples:
             raise ValueError(f"columns of {lengths} rows, stamp_ns has {len(self.stamp_ns)}")
 
     def cut(self, rows: slice | Bools) -> Self:
-        """Return the samples of some rows."""
+        """Return the samples in some rows."""
         part: Self = replace(cast(Any, self), **{name: column[rows] for name, column in self._columns().items()})
         return part
 
@@ -46,7 +46,7 @@ class Samples:
 
 
 def without_repeats(column: Floats) -> Floats:
-    """Return a column; one whose values are all equal takes no memory."""
+    """Return a column of the same values; a column of equal values then holds the memory of one value."""
     return np.broadcast_to(column[:1].copy(), column.shape) if len(column) and (column == column[0]).all() else column
 
 
@@ -61,10 +61,11 @@ class WheelSamples(Samples):
     ----------
     stamp_ns : int64 (n,), strictly increasing
     left, right : float64 (n,), forward positive, each held over [k, k+1); [m/s], or in `unit` per second
-    unit : ``mps``: speeds that are ready to use; else as the log sends them, in this unit per second, without the
-        configured scales, until `icrtool.alignment.wheel_units` has made speeds of them
-    from_position : the log sends positions; these are their mean speeds to the next sample
-    restarts_ns : stamps of the samples after which the positions began again; the motion in this gap is not known
+    unit : ``mps``: speeds that are ready to use. Another unit: speeds as sent, in this unit per second and without the
+        configured scales; `icrtool.alignment.wheel_units` converts them to m/s
+    from_position : the log has positions; `left` and `right` are the mean speeds to the next sample
+    restarts_ns : stamps of the samples after which the encoder positions started again; the motion in these gaps is not
+        known
     """
 
     stamp_ns: Ints
@@ -99,7 +100,8 @@ class PositionFixes(Samples):
     stamp_ns : int64 (n,), non-decreasing
     north_m, east_m : float64 (n,)
     var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where not stated
-    stated_class : uint8 (n,), NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message states any
+    stated_class : uint8 (n,), NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message
+        states a kind of fix
     """
 
     stamp_ns: Ints
@@ -201,7 +203,7 @@ OWN_TWIST = " (body twist)"
 
 @dataclass(frozen=True, slots=True)
 class StreamChoice:
-    """Which topic feeds a role, and why.
+    """The topic that provides the samples of a role, and the reason.
 
     Attributes
     ----------
@@ -222,19 +224,19 @@ class StreamChoice:
 
     @property
     def samples_text(self) -> str:
-        """Number of samples, and their rate where it is known."""
+        """Text with the number of samples and, where it is known, their rate [Hz]."""
         return f"{self.count} samples" + (f" at {self.rate_hz:.4g} Hz" if self.rate_hz is not None else "")
 
     @property
     def is_twist(self) -> bool:
-        """Whether the wheels' speeds were made of a body twist; a pair of topics or fields holds speeds of its own."""
+        """Whether the wheel speeds were computed from a body twist. A pair of topics or fields holds wheel speeds."""
         if self.message_type.endswith(OWN_TWIST):
             return self.role == "wheels"
         return self.role == "wheels" and self.message_type in TWIST_TYPES and " + " not in self.topic
 
 
 def are_twist(streams: Iterable[StreamChoice]) -> bool:
-    """Return whether the wheels' speeds of a log with these streams were made of a body twist."""
+    """Return whether the wheel speeds of a log with these streams were computed from a body twist."""
     return any(stream.is_twist for stream in streams)
 
 
@@ -249,7 +251,7 @@ def rate_and_jitter(stamps: Ints) -> tuple[float | None, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class HeadingSensor:
-    """The topic that states a heading; `convention`: how its yaw was read."""
+    """The topic that states a heading. `convention` is the convention in which its yaw was read."""
 
     topic: str
     message_type: str
@@ -264,8 +266,8 @@ class InputFile:
     ----------
     path : as given, without a password or token
     sha256 : hex; None where not all of it was read
-    etag, version : what an object store, or a web server, states about the content
-    address : SHA-256 of the whole address, with what `path` leaves out
+    etag, version : tags of the content by an object store or a web server
+    address : SHA-256 of the whole address, with the password and token that `path` leaves out
     """
 
     path: str
@@ -277,11 +279,11 @@ class InputFile:
 
     @property
     def identity(self) -> tuple[object, ...]:
-        """Equal for files of equal content: SHA-256, else size and version, else size and address."""
+        """Key that is equal for files of equal content: SHA-256, else size and version, else size and address."""
         if self.sha256 is not None:
             return (self.sha256,)
         version = self.version if self.version is not msgspec.UNSET else self.etag
-        # a time of modification is no version: many files may have it
+        # A time of modification is no version, because many files may have the same time.
         is_version = isinstance(version, str) and bool(version) and not version.endswith(" GMT")
         where = self.path if self.address is msgspec.UNSET else self.address
         return (self.bytes, version) if is_version else (self.bytes, where)

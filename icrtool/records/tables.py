@@ -1,4 +1,4 @@
-"""The tables that pass from package to package: a robot's log, also made of data frames, and the states of a run."""
+"""The tables that packages exchange: a robot's log, which may be made of data frames, and the states of a run."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Icrs = tuple[float, float, float]
 """y_icr_right, y_icr_left, x_icr [m]."""
 
 LARGEST_STATE = 1e30
-"""Largest number of a state or a measurement: squares of larger numbers overflow."""
+"""Largest number of a state or a measurement. Squares of larger numbers may overflow."""
 
 WHEEL_COLUMN_UNITS: dict[tuple[str, ...], tuple[WheelUnit, bool]] = {
     ("v_left_mps", "v_right_mps"): ("m", False),
@@ -46,14 +46,14 @@ WHEEL_COLUMN_UNITS: dict[tuple[str, ...], tuple[WheelUnit, bool]] = {
     ("pos_left_rad", "pos_right_rad"): ("rad", True),
     ("pos_left_counts", "pos_right_counts"): ("counts", True),
 }
-"""Columns of data frames: unit, and whether they are positions."""
+"""Columns of wheels in data frames: for each pair its unit, and whether it holds positions."""
 
 POSITION = (("north_m", "east_m"), ("latitude_deg", "longitude_deg"))
 POSITION_STD = (("north_std_m", "east_std_m"), ("position_std_m", "position_std_m"))
 HEADING_COLUMNS = (("heading_rad",), ("heading_deg",), ("yaw_rad",), ("yaw_deg",))
 GYRO_COLUMNS = (("turn_rate_radps",), ("yaw_rate_radps",))
 HEADING_STD = (("heading_std_rad", 1.0), ("heading_std_deg", math.pi / 180))
-"""Columns of the standard deviation of headings, and their units [rad]."""
+"""Columns of the standard deviation of headings, each with its unit in radians."""
 
 CLOCK_COLUMNS, HEIGHT_COLUMN = (("stamp_ns",), ("t_s",)), "height_m"
 
@@ -68,26 +68,27 @@ LATEST_S = 4e9
 """Limit of stamps, the year 2096: differences of larger stamps may overflow 64 bits of nanoseconds."""
 
 LARGEST_STD = 1e9
-"""A stated standard deviation from here on [m, rad] is taken as not known."""
+"""Largest stated standard deviation that counts [m, rad]; larger values are taken as not known."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class RobotLog:
-    """What a robot measured on one drive: the tables the filter needs, and where they came from.
+    """Measurements of a robot on one drive: the tables that the filter needs, and their sources.
 
     Attributes
     ----------
     datum : None where the position reference was metric already (total station, lidar, motion capture)
     rejected_fixes : number of fixes dropped while reading, by reason (``no fix``, ``not finite`` ...)
     notes : findings, in the order they were made; `warnings` : their sentences
-    antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None without one
-    gyro : turn rates of an inertial unit, None without one; the filter does not use them
-    heading : without a row where no topic states one
+    antenna_m : position of the antenna from the body origin by the transforms in the log, forward and right [m]; None
+        without such a transform
+    gyro : turn rates of an inertial unit, None without an inertial unit; the filter does not use them
+    heading : headings; no row where no topic states a heading
     gyros : all inertial units with turn rates, all axes
     other_receivers : further GNSS receivers
-    other_references : the same log with another position reference and its heading, where it holds one
-    slipping_ns : (k, 2) begins and ends of the slip events found in it: its wheels show nothing there
-    heading_sensor : the topic that states the heading, None without one
+    other_references : the same log with each other position reference that it holds, and the heading of that reference
+    slipping_ns : (k, 2) begins and ends of the slip events in the log, in which the wheels do not show the motion
+    heading_sensor : the topic that states the heading, None without a heading
     """
 
     name: str
@@ -114,8 +115,8 @@ class RobotLog:
     ) -> RobotLog:  # fmt: skip
         """Return a log from one data frame for each sensor, or one frame for several; all stamps on one clock.
 
-        Columns are found by their names, which end in their units. Stamps: ``stamp_ns``, or ``t_s`` (seconds). Each
-        group needs one pair or column; a row without numbers in it is no sample of that group.
+        Columns are found by their names, which end with the unit. Stamps are in ``stamp_ns`` or ``t_s`` (seconds). Each
+        group needs one of its pairs or columns. A row without numbers in these columns is no sample of the group.
 
         ======== ======================================================================================================
         wheels   ``v_left_mps, v_right_mps`` · ``v_left_radps, v_right_radps`` · ``pos_left_m, pos_right_m`` ·
@@ -129,7 +130,7 @@ class RobotLog:
 
         Parameters
         ----------
-        name : of the log
+        name : name of the log
 
         Raises
         ------
@@ -169,7 +170,7 @@ class RobotLog:
         return warnings_of(self.notes)
 
     def topic(self, role: Role, unknown: str = "") -> str:
-        """Return the topic that a stream came from."""
+        """Return the topic of the stream with a role."""
         return next((stream.topic for stream in self.streams if stream.role == role), unknown)
 
     @property
@@ -195,7 +196,7 @@ class RobotLog:
 
 
 def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str, name: str) -> tuple[str, ...]:
-    """Return the first of the column groups that is complete in the frame.
+    """Return the first column group that is complete in the frame.
 
     Raises
     ------
@@ -213,7 +214,7 @@ def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str,
 
 
 def _numbers(frame: pd.DataFrame, column: str, name: str) -> Floats:
-    """Return a column (n,), NaN where it is empty."""
+    """Return a column (n,) as numbers, NaN for empty cells."""
     try:
         return np.asarray(frame[column], np.float64)
     except (TypeError, ValueError, OverflowError) as err:
@@ -221,13 +222,13 @@ def _numbers(frame: pd.DataFrame, column: str, name: str) -> Floats:
 
 
 def _values(frame: pd.DataFrame, column: str, name: str) -> Floats:
-    """Return a column (n,) of measurements: as in messages, a number above `LARGEST_STATE` is infinite."""
+    """Return a column (n,) of measurements; a number above `LARGEST_STATE` becomes infinite, as in messages."""
     values = _numbers(frame, column, name)
     return np.where(np.abs(values) > LARGEST_STATE, np.copysign(np.inf, values), values)
 
 
 def _rows(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) -> tuple[Ints, list[Floats]]:
-    """Return stamps (n,), strictly increasing, and columns of the rows that have numbers in all of them."""
+    """Return stamps (n,), strictly increasing, and columns (n,) of the rows with numbers in all columns."""
     clock, seconds, sound = _stamped(frame, columns, group, name)
     if np.any(np.abs(seconds[sound]) > LATEST_S):
         raise DataError(name, f"column {clock}: a stamp of {np.abs(seconds[sound]).max():.3g} s", "is it in its unit?")
@@ -244,7 +245,7 @@ def _rows(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) ->
 
 
 def _stamped(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str) -> tuple[str, Floats, Bools]:
-    """Return the column of stamps, its values [s] (rows,), and which rows have numbers in it and in `columns`."""
+    """Return the name of the stamp column, its values (rows,) [s], and which rows (rows,) have all their numbers."""
     (clock,) = _chosen(frame, CLOCK_COLUMNS, group, name)
     seconds = _numbers(frame, clock, name) * (1.0 if clock == "t_s" else 1e-9)
     values = [seconds, *(_values(frame, column, name) for column in columns)]
@@ -278,7 +279,7 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
         height = np.nan_to_num(extra.get(HEIGHT_COLUMN, unknown))
         datum = Datum(float(first[0]), float(second[0]), float(height[0]))
         north, east, _ = geodetic2ned(first, second, height, datum.latitude_deg, datum.longitude_deg, datum.height_m)
-    # The square of a standard deviation that is no real one may overflow.
+    # The square of an impossible standard deviation may overflow.
     real = {std: np.where(np.abs(extra[std]) < LARGEST_STD, extra[std], np.nan) for std in stds}
     var_north, var_east = (real[stds[0]] ** 2, real[stds[1]] ** 2) if stds else (unknown, unknown.copy())
     covariance = np.zeros(len(stamps)) if stds else unknown.copy()
@@ -286,7 +287,7 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
 
 
 def _at(frame: pd.DataFrame, column: str, group: Sequence[str], stamps: Ints, name: str) -> Floats:
-    """Return an optional column (n,) at the stamps of a group, NaN where it is empty."""
+    """Return an optional column at the stamps (n,) of a group, NaN for empty cells."""
     filled = frame[np.isfinite(_values(frame, column, name))]
     out = np.full(len(stamps), np.nan)
     if len(filled) >= 2:
@@ -311,13 +312,13 @@ def _heading(frame: pd.DataFrame, name: str) -> tuple[HeadingSamples, tuple[str,
 
 @dataclass(frozen=True, slots=True)
 class States:
-    """Recorded filter states, one per wheel sample. The columns of states.csv, in its order; all of shape (n,).
+    """Recorded filter states, one for each wheel sample: the columns of states.csv in their order, each of shape (n,).
 
     Attributes
     ----------
-    heading_rad : unwrapped
+    heading_rad : heading, clockwise from north, unwrapped
     std_* : one standard deviation, the square root of the diagonal of P
-    v_left_mps, v_right_mps : held until the next state
+    v_left_mps, v_right_mps : wheel speeds, held until the next state
     distance_m : path length since the first state
     """
 
@@ -344,7 +345,7 @@ class States:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def changed(self, **columns: Floats | Ints) -> States:
-        """Return the states with some other columns."""
+        """Return the states with some columns replaced."""
         return replace(self, **cast(Any, columns))
 
     def icrs_at(self, row: int) -> Icrs:
@@ -359,7 +360,7 @@ class States:
 
     @property
     def fault(self) -> str:
-        """Why these cannot be states of a filter: none, not in order, not finite; empty where nothing is wrong."""
+        """Return why these are no states of a filter (no states, not in order, not finite); empty for valid states."""
         if not len(self):
             return "there are no states"
         if np.any(self.stamp_ns[1:] <= self.stamp_ns[:-1]):

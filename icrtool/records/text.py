@@ -7,28 +7,28 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Self
 
 LONGEST_NAME = 80
-"""Characters of a name that are printed; of a longer name, the beginning and the end are printed."""
+"""Largest length of a printed name [characters]; of a longer name the beginning and the end are printed."""
 
 LONGEST_TEXT = 512
-"""Characters of a text from a log that are used (a topic of ROS has up to 255): long ones take time to look through."""
+"""Largest length of a text from a log [characters]; the rest is dropped. A topic of ROS has up to 255 characters."""
 
 LONGEST_STORED = 1000
-"""Characters of a text from a file of icrtool that are used; a warning has a few hundred."""
+"""Largest length of a text from a file of icrtool [characters]. A warning has a few hundred characters."""
 
 LONGEST_MESSAGE = 4000
-"""Characters of an error or a warning that are printed."""
+"""Largest length of a printed error or warning [characters]."""
 
 
 LEAST_LIKENESS, LEAST_LETTERS = 0.6, 3
-"""Least similarity (`difflib`) of a word that is proposed, and least length of a given text that a proposed word
-contains."""
+"""Smallest similarity (`difflib`) of a proposed word, and smallest length of a typed text [characters] for which words
+that contain the text are proposed."""
 
 
 class LogText(str):
     r"""A text from a log that prints only escaped and shortened.
 
-    The string itself is the escaped text, so what is made of it by joining, splitting or slicing is safe to print
-    too. `str` and `format` shorten it as well. Comparisons and dictionaries use the whole escaped text, so two long
+    The string itself is the escaped text, so texts made by joining, splitting or slicing are safe to print, too. `str`
+    and `format` shorten the text as well. Comparisons and dictionaries use the whole escaped text, so two long
     names that differ in the middle stay different.
 
     Attributes
@@ -45,7 +45,7 @@ class LogText(str):
     raw: str
 
     def __new__(cls, raw: str) -> Self:
-        """Return `raw` as a LogText; a LogText is returned as it is."""
+        """Return `raw` as a LogText; a LogText is returned unchanged."""
         if isinstance(raw, cls):
             return raw
         raw = raw[:LONGEST_TEXT]
@@ -78,11 +78,11 @@ def escaped(text: str) -> str:
 
 
 def escaped_texts(value: Any, names: Collection[str] = ()) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return what a JSON file holds with all its texts escaped, and of at most `LONGEST_STORED` characters.
+    """Return the content of a JSON file with all texts escaped and shortened to `LONGEST_STORED` characters.
 
     Parameters
     ----------
-    names : keys whose texts stand there as in the log: they become `LogText`
+    names : keys of texts that are stored without escapes, as in the log; these texts become `LogText`
     """
     if isinstance(value, dict):
         return {
@@ -95,7 +95,7 @@ def escaped_texts(value: Any, names: Collection[str] = ()) -> Any:  # noqa: ANN4
 
 
 def table_cell(text: str) -> str:
-    """Return a text as a cell of a CSV table: escaped, and nothing that a spreadsheet takes for a formula.
+    """Return a text as a cell of a CSV table: escaped, and never a formula of a spreadsheet.
 
     A text that begins with ``=``, ``+``, ``-`` or ``@`` gets an apostrophe before it (OWASP, CSV injection).
     """
@@ -121,7 +121,7 @@ MOST_NAMED = 12
 
 
 def listed(names: Sequence[str], most: int = MOST_NAMED) -> str:
-    """Return names, escaped and shortened, with commas; beyond `most` of them, how many more there are."""
+    """Return at most `most` names, escaped and shortened, with commas, and the number of names left out."""
     shown = ", ".join(str(LogText(name)) for name in names[:most])
     return shown + (f" and {len(names) - most} more" if len(names) > most else "")
 
@@ -131,7 +131,7 @@ MOST_DIGITS = 5
 
 
 def digits_of(std: float, least: int = 2) -> int:
-    """Return the decimals that a value with this standard deviation needs: two digits of a `std` that begins with 1."""
+    """Return the number of decimals of a value, by its standard deviation: two digits of a `std` that begins with 1."""
     if not 0.0 < std < math.inf:
         return least
     exponent = math.floor(math.log10(std))
@@ -153,7 +153,7 @@ def with_interval(metres: float, low: float | None, high: float | None) -> str:
 
 
 def did_you_mean(word: str, words: Iterable[str]) -> str:
-    """Return ``did you mean X? `` for the known word that is most like `word`, for a message; empty where none is."""
+    """Return ``did you mean X? `` with the known word most similar to `word`; empty without a similar word."""
     from difflib import get_close_matches
 
     choices = {str(choice).lower(): str(choice) for choice in words}

@@ -18,9 +18,9 @@ class TopicPoses:
     topic, message_type : as in the log
     header_ns : int64 (n,) header stamps, increasing; None where they cannot be used
     log_ns : int64 (n,) log times, increasing
-    place : (n,) position [m]; the imaginary axis is 90 deg clockwise of the real one, seen from above
-    heading : (n,) of the body's forward axis, clockwise from the real axis, unwrapped [rad]
-    gap : (n - 1,) intervals without messages, far longer than the others
+    place : complex (n,) position [m]; the imaginary axis is 90 deg clockwise of the real axis, seen from above
+    heading : (n,) heading of the body's forward axis, clockwise from the real axis, unwrapped [rad]
+    gap : bool (n - 1,), whether an interval between messages is far longer than the others
     """
 
     topic: str
@@ -32,7 +32,7 @@ class TopicPoses:
     gap: Bools
 
     def stamps(self, *, by_log_time: bool) -> Ints:
-        """Return the stamps (n,): header stamps, or log times where these cannot be used or `by_log_time` is set."""
+        """Return the stamps (n,): header stamps; log times if there are no header stamps or `by_log_time` is set."""
         return self.log_ns if by_log_time or self.header_ns is None else self.header_ns
 
     def at(self, t: Floats, at: Floats) -> tuple[Complexes, Floats]:
@@ -40,7 +40,7 @@ class TopicPoses:
         return np.interp(at, t, self.place), np.interp(at, t, self.heading)
 
     def covered(self, t: Floats, begin: Floats, end: Floats) -> Bools:
-        """Return which spans of time (m,) have poses at `t` (n,) [s] all along: before, after, and no gap between."""
+        """Return whether poses at `t` (n,) [s] cover each span of time (m,): poses before and after it, and no gap."""
         gaps = np.append(0, np.cumsum(self.gap))
         first = np.searchsorted(t, begin, side="right") - 1
         last = np.searchsorted(t, end, side="left")
