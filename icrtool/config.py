@@ -1,6 +1,7 @@
-"""Validated configuration: built-in robot < TOML file < ``--set`` < option. Out again as plain data for run.json.
+"""The validated configuration. Its layers, the later ones win: built-in robot, TOML file, ``--set``, option.
 
-What each key means stands in ``config_keys.toml``, which ``icrtool config`` prints with types, bounds and defaults.
+``config_keys.toml`` has the meaning of each key; ``icrtool config`` prints it with types, bounds and defaults. run.json
+holds the effective configuration as plain data.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ MOST_LIST_ITEMS = 1000
 """Most entries in a list of horizons or outages."""
 
 _DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]+\s*\.\s*){64}")
-"""A key of more than 64 parts, which is refused."""
+"""Pattern of a key of more than 64 parts, which is refused."""
 
 _BARE_POINT = re.compile(r"(?<![\w.])(?=\.\d)|(?<=\d\.)(?![\w.])|(?<=\d\.)(?=[eE])")
-"""Places in numbers where TOML requires a zero that people leave out."""
+"""Pattern of the places in numbers where TOML requires a zero that people leave out (``.5``, ``1.``)."""
 
 Horizon = Annotated[float, msgspec.Meta(ge=0.001, le=1e5)]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
@@ -62,7 +63,7 @@ class RobotConfig:
 
 @dataclass(frozen=True, slots=True)
 class TopicsConfig:
-    """Topics by role, the clock of their stamps, and whether the status of fixes counts."""
+    """Topics by role, the clock of their stamps, and whether the stated status of fixes is used."""
 
     wheels: str | None = None
     wheel_left: str | None = None
@@ -86,7 +87,7 @@ class TopicsConfig:
 
     @property
     def fields_of_wheels(self) -> dict[str, str]:
-        """The fields that are named as wheels, by key: of both sides, or of a body twist; empty without any."""
+        """The configured fields of the wheels by key: of both sides, or of a body twist; empty without fields."""
         keys = ("wheel_left", "wheel_right") if self.wheel_left is not None else ("twist_speed", "twist_turn")
         named = {key: getattr(self, key) for key in keys}
         return {} if None in named.values() else named
@@ -128,9 +129,9 @@ class FramesConfig:
 class FilterConfig:
     """The EKF of Pentzer 2014, Section 3.
 
-    `process_*` are the square roots of Q's diagonal (Eq. 30), as at the paper's 100 Hz; `gnss_std_m` and
-    `heading_std_deg` the standard deviations of R (Eq. 31); `terrain_icr_std_m`: Section 5.2. A value left out is the
-    preset's.
+    `process_*` are the square roots of the diagonal of Q (Eq. 30) at the paper's 100 Hz. `gnss_std_m` and
+    `heading_std_deg` are the standard deviations of R (Eq. 31). `terrain_icr_std_m` is described in Section 5.2. For a
+    key without a value the preset has the value.
     """
 
     preset: Literal["field", "paper"] = "field"
@@ -152,13 +153,13 @@ class FilterConfig:
 
     @property
     def rules(self) -> Preset:
-        """What the preset decides."""
+        """The record of the preset."""
         return PRESETS[self.preset]
 
 
 @dataclass(frozen=True, slots=True)
 class DropoutConfig:
-    """The analysis of Section 6.4."""
+    """Distances and forced outages of the analysis without GNSS (Pentzer 2014, Section 6.4)."""
 
     horizons_m: tuple[Horizon, ...] = tuple(float(d) for d in range(1, 21))
     forced_outage_s: tuple[Duration, ...] = ()
@@ -185,7 +186,7 @@ class Config:
     frames : heading convention and offset [deg], delays [s], antenna position [m], datum [deg, deg, m]
     filter : preset, start, noise, gates
     dropout : distances without GNSS [m], forced outages [s]
-    given : the keys that were set, by robot, file or ``--set``, as ``section.key``; the rest has its default
+    given : the keys that robot, file or ``--set`` set, as ``section.key``; the other keys have their defaults
     """
 
     robot: RobotConfig = RobotConfig()
@@ -207,7 +208,7 @@ class Config:
 
 
 SECTIONS: dict[str, type] = {part.name: type(part.default) for part in fields(Config) if part.name != "given"}
-"""The sections of a configuration file, and what each holds."""
+"""Types of the sections of a configuration file, by name."""
 
 
 def parse_config(document: Mapping[str, Any]) -> Config:
@@ -243,7 +244,7 @@ def builtin_robots() -> dict[str, dict[str, Any]]:
 
 
 def key_texts() -> dict[str, dict[str, dict[str, Any]]]:
-    """Return by section and key what it means (``text``), and an ``example`` where it has no default."""
+    """Return by section and key the meaning (``text``), and an ``example`` for a key without default."""
     return tomllib.loads(resources.files("icrtool").joinpath("config_keys.toml").read_text(encoding="utf-8"))
 
 
@@ -282,14 +283,14 @@ def load_config(path: str | Path | None = None, robot: str | None = None, sets: 
 
 
 class ConfigSources(NamedTuple):
-    """What a configuration is loaded from: the arguments of `load_config`."""
+    """Sources of a configuration: the arguments of `load_config`."""
 
     file: Path | None = None
     robot: str | None = None
     sets: tuple[str, ...] = ()
 
     def load(self) -> Config:
-        """Return the configuration; errors as of `load_config`."""
+        """Return the configuration; the errors are the errors of `load_config`."""
         return load_config(*self)
 
 
@@ -305,14 +306,14 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return what a TOML text holds.
+    """Return the content of a TOML text as dicts, lists, texts and numbers.
 
     Raises
     ------
     RecursionError
         Its values, or the parts of its keys, are nested too deeply: tomllib takes gigabytes for a key of 20,000 parts.
     ValueError
-        It is no TOML.
+        The text is not TOML.
     """
     if _DEEP_KEY.search(text):
         raise RecursionError
@@ -333,7 +334,7 @@ def _parse_set(text: str) -> dict[str, Any]:
     if not value.strip():
         raise ConfigError(key.strip(), "its value is empty", "leave the option out for the default")
     parsed: Any = value.strip()
-    # As TOML reads it, with numbers as people type them (.08, 1.); else it is a text.
+    # The value is TOML, with numbers as people type them (.08, 1.); a value that is no TOML is a text.
     for toml in (value, _BARE_POINT.sub("0", value)):
         try:
             parsed = parse_toml(f"value = {toml}")["value"]
@@ -359,12 +360,12 @@ def _found(value: object) -> str:
 
 
 def _flaw(value: object) -> str | None:
-    """Return what is wrong with a value, whatever the type of its key."""
+    """Return why a value is refused for a key of any type; empty for a valid value."""
     if isinstance(value, list | tuple):
         return next(filter(None, map(_flaw, value)), None)
     if isinstance(value, float) and not math.isfinite(value):
         return "not a finite number"
-    # Lone surrogates, of an argument that is not UTF-8, do not print either; no JSON file takes them.
+    # Lone surrogates, from an argument that is not UTF-8, cannot be printed or written to JSON.
     if isinstance(value, str) and not value.isprintable():
         return "has characters that do not print"
     return None
@@ -391,7 +392,7 @@ def describe_key(section: str, key: str) -> str:
 
 
 def words_of_key(section: str, key: str) -> tuple[str, ...]:
-    """Return the words that a key takes, as ``auto``; empty where it is no key, or takes none."""
+    """Return the words that are values of a key, for example ``auto``; empty without words or for an unknown key."""
     if section not in SECTIONS:
         return ()
     return _literals(get_type_hints(SECTIONS[section]).get(key))
@@ -403,7 +404,7 @@ def _literals(kind: Any) -> tuple[str, ...]:  # noqa: ANN401 - a type, as annota
 
 
 def _described(kind: Any) -> str:  # noqa: ANN401 - a type, as annotations have it
-    """Return a key's type in the words of TOML."""
+    """Return the type of a key in the words of TOML."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         bounds = ((">", parts[1].gt), ("≥", parts[1].ge), ("<", parts[1].lt), ("≤", parts[1].le))

@@ -1,1 +1,1 @@
-"""Many logs in one go: find the recordings, process each in a process of its own, collect a row of each."""
+"""Batches of many logs: find the recordings, process each log in a separate process, and collect a row for each."""

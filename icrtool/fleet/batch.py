@@ -1,4 +1,4 @@
-"""A batch: hand logs to an executor, skip logs that are done, retry logs whose process died, give a row for each."""
+"""Run a batch: pass logs to an executor, skip finished logs, retry logs whose process died, yield a row for each."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ POLL_S = 1.0
 """Time between two checks of a cluster [s]."""
 
 WatchLog = Callable[[str, str], None]
-"""Called with the name of a log and its stage."""
+"""Function that is called with the name of a log and its stage."""
 
 
 def plan_requests(
@@ -65,11 +65,11 @@ def plan_requests(
     ConfigError
         A manifest or a configuration cannot be used, or a gate cannot be read.
     OutputError
-        `output` is a run, or something else than a directory, or holds a file of the user with the name of a result.
+        `output` is a run, is not a directory, or holds a file of the user with the name of a result.
     """
     gates = [parse_gate(gate) for gate in batch.report.gates]
     _check_output(output, folder or output, batch)
-    # A pattern of the shell may also name tables of simulated truth beside their logs. They are no manifests.
+    # A pattern of the shell may also name tables of simulated truth next to their logs, which are no manifests.
     other_files = logs_among([place for place in places if place.is_file()])[1]
     places = [place for place in places if place not in other_files]
     entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
@@ -92,7 +92,7 @@ def plan_requests(
 
 
 def _check_output(output: Path, folder: Path, batch: BatchRequest) -> None:
-    """Refuse a folder of results where a batch cannot write; `folder` is the folder on disk."""
+    """Refuse a folder of results that a batch cannot write to; `folder` is the folder on disk."""
     if (folder / RUN_FILE).is_file():
         raise OutputError(output, "is a run itself", "name another place for the batch")
     if folder.exists() and not folder.is_dir():
@@ -101,7 +101,7 @@ def _check_output(output: Path, folder: Path, batch: BatchRequest) -> None:
 
 
 def _open_baseline(batch: BatchRequest, output: Path) -> Baseline | None:
-    """Return the reports of the baseline of a batch; None where it has none."""
+    """Return the reports of the baseline of a batch; None for a batch without a baseline."""
     if batch.baseline is None:
         return None
     from icrtool.output.dropout_directory import open_baseline
@@ -119,13 +119,13 @@ def _request_for(
 
     Parameters
     ----------
-    entries : of manifests
+    entries : lines of the manifests
     output : folder of the results
-    baseline : digest of the baseline; empty without one
+    baseline : digest of the baseline; empty without a baseline
     """
     about, settings = about_recording(recording.path, entries), batch.settings
     builtin = about.robot in builtin_robots()
-    # The name of a robot that is not built in needs a configuration of its own.
+    # A robot that is not built in needs a configuration file.
     if about.robot and not builtin and about.config is None and settings.file is None:
         advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
         raise ConfigError(f"{recording.log}: robot {about.robot!r}", "not a built-in robot", advice)
@@ -133,7 +133,7 @@ def _request_for(
     config = settings._replace(file=about.config or settings.file, robot=robot).load()
     # The key does not depend on whether a page is asked for: `find_finished_row` looks for the file report.html.
     files = replace(batch.files, page=True, overwrite=False)
-    # The stem is in the name of the row.
+    # The name of the row in the report contains the stem of the file.
     named_calibrations = [
         (as_text(file.stem), one.sha256) for file, one in zip(batch.calibrations, calibrations, strict=True)
     ]
@@ -151,7 +151,7 @@ def _request_for(
 
 
 def _content_of(path: Path, baseline: Baseline) -> tuple[str, ...]:
-    """Return the SHA-256 of each file of a log, where the baseline may have a log of the same content."""
+    """Return the SHA-256 of each file of a log; empty where no log of the baseline can have the same content."""
     if isinstance(path, UrlPath) or not any(baseline.sha256.values()):
         return ()
     return tuple(file_sha256(file) for file in files_of_log(path))
@@ -160,7 +160,7 @@ def _content_of(path: Path, baseline: Baseline) -> tuple[str, ...]:
 def find_finished_row(request: LogRequest, folder: Path) -> FleetLog | None:
     """Return the row of a log that an earlier batch processed with the same input, configuration and version.
 
-    A log that failed by its content, and would fail again, counts as processed.
+    A log whose content makes it fail counts as processed, because it would fail again.
 
     Parameters
     ----------
@@ -187,8 +187,8 @@ def run_batch(
 
     Parameters
     ----------
-    executor : runs `process_apart`; threads on this machine, or workers of a cluster
-    watch : called when a log comes to its next stage, where the executor is on this machine
+    executor : executor that calls `process_apart`, in threads on this machine or in workers of a cluster
+    watch : called with the next stage of a log, if the executor is on this machine
     lost : returns why the executor can process no log any more; empty while it can
     folder : folder on disk that is used where the results go to an address
     """
@@ -208,7 +208,7 @@ def run_batch(
         else:
             yield row
     for request in again:
-        # One at a time: a log that lacked memory while others ran may have enough alone.
+        # One log at a time: a log that lacked memory while other logs were processed may have enough memory alone.
         for _, row in _all_of([request], executor, batch, watch, lost):
             yield replace(row, reason=f"{row.reason} (tried twice)") if row.status == "failed" else row
 
@@ -247,7 +247,7 @@ def _all_of(
 
 
 def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
-    """Return whether a log's files are the files of an earlier batch; content is compared where times differ."""
+    """Return whether the files of a log are as in an earlier batch; content is compared where times differ."""
     if isinstance(path, UrlPath):
         return bool(stored) and _is_unchanged(stored[0], path)
     try:

@@ -1,4 +1,4 @@
-"""What a batch writes: tables, figures, results of acceptance limits for CI, and calibrations.
+"""Files that a batch writes: tables, figures, results of acceptance limits for CI, and calibrations.
 
 There is one calibration per robot and group. It is tested by leaving out each log in turn.
 """
@@ -37,7 +37,7 @@ AFTER_ERRORS = ("events", "outages", "warnings", "tool_version", "run")
 """Columns of fleet.csv that are fields of a log's row, before and after the columns of ICRs and errors."""
 
 WITHIN, IS_BOUND = "_within_", "_is_bound"
-"""Parts of column names: of a distance within a budget, and of whether it is a lower bound (1) or not (0)."""
+"""Parts of column names: of a distance within a budget [m], and of its column that is 1 for a lower bound, else 0."""
 
 FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
 
@@ -47,16 +47,16 @@ CALIBRATIONS = "calibrations"
 """Folder of the calibration files, below the folder of the batch."""
 
 MOST_POOLED_S = 86_400.0
-"""Longest total time of the logs of a robot and group that are calibrated together [s]. Of more logs, some are chosen
-evenly over all of them. This time needs about 1 GB of memory."""
+"""Longest total time of the logs of a robot and group that are calibrated together [s]. Logs of a longer total time are
+sampled evenly. The calibration of logs of this time needs about 1 GB of memory."""
 
 FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
-"""Folders that a batch writes."""
+"""Names of the folders that a batch writes."""
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", FLEET_FILE)
 
 SHOWN_ERRORS = {MAIN_ROW: documents.SHOWN_ERROR, FALLBACK_ROW: documents.SHOWN_FALLBACK}
-"""Rows whose errors the picture may show, and their columns; it shows the first row that any log has."""
+"""Columns of errors that the picture can show, by row. The picture shows the first row that any log has."""
 
 
 def check_tables(folder: Path, *, page: bool) -> None:
@@ -69,7 +69,7 @@ def check_tables(folder: Path, *, page: bool) -> None:
     Raises
     ------
     OutputError
-        There is one.
+        There is such a file.
     """
     if page and folder.is_dir():
         check_place(Below(folder, PAGE_FILE), is_page)
@@ -82,13 +82,13 @@ def check_tables(folder: Path, *, page: bool) -> None:
 
 
 def pictures_of_batch(folder: Path) -> list[Path]:
-    """Return where the pictures of a batch are in its folder, in every format."""
+    """Return the paths of the pictures of a batch, below its folder, in every format."""
     names = [name for name, entry in FIGURES.items() if entry.of == "fleet"]
     return [folder / PLOTS / f"{name}.{form}" for name in names for form in formats.PLOT_FORMATS]
 
 
 def fleet_document(rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibration] = ()) -> FleetDocument:
-    """Return what fleet.json holds: how many logs were done or failed, the row of each log, pooled calibrations."""
+    """Return the content of fleet.json: numbers of logs that were done and failed, rows of the logs, calibrations."""
     counts = Counter(row.status for row in rows) + Counter(row.this_time for row in rows)
     return FleetDocument(
         schema=documents.FLEET_SCHEMA,
@@ -138,7 +138,7 @@ def write_fleet(
     Raises
     ------
     OutputError
-        They cannot be written to the disk.
+        The files cannot be written to the disk.
     """
     cells = fleet_rows(rows)
     write_file(Below(directory, "fleet.csv"), formats.csv_bytes(cells[0], (row.values() for row in cells)))
@@ -149,7 +149,7 @@ def write_fleet(
     if plots:
         write_figures(rows, directory, plots)
     document = fleet_document(rows, calibrations)
-    # Written after the tables: where it exists, the tables are of the same batch.
+    # fleet.json is written after the tables: where it exists, the tables are from the same batch.
     write_file(Below(directory, FLEET_FILE), formats.json_bytes(document))
     if page:
         from icrtool.output.page.pages import fleet_page
@@ -180,7 +180,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
 
     Parameters
     ----------
-    folder : of the batch
+    folder : folder of the batch
     """
     from icrtool.output.figures.calibrations import FleetNumbers
 
@@ -221,7 +221,7 @@ def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
     texts.add("notes")
     counts = {"events", "outages", "warnings", "gates_failed", *(name for name in rows[0] if name.endswith(IS_BOUND))}
     kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in rows[0]}
-    # Names of files need not be text. Lists are written as JSON, because pyarrow would load pandas to convert them.
+    # Names of files need not be valid text. Lists are written as JSON, because pyarrow would load pandas for lists.
     cells = ({name: as_text(one) if name in texts else one for name, one in row.items()} for row in rows)
     lines = b"\n".join(map(msgspec.json.encode, cells))
     table = pj.read_json(
@@ -231,7 +231,7 @@ def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
 
 
 def counts_text(rows: Sequence[FleetLog]) -> str:
-    """Return how many logs were done and failed, and how many of them by an earlier batch."""
+    """Return a text with the numbers of logs that were done, that failed, and that an earlier batch processed."""
     counts = Counter(row.status for row in rows)
     text = ", ".join(f"{counts[status]} {status}" for status in ("done", "failed") if counts[status])
     skipped = sum(row.this_time == "skipped" for row in rows)
@@ -239,13 +239,13 @@ def counts_text(rows: Sequence[FleetLog]) -> str:
 
 
 def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[Block]:
-    """Return a batch: counts, acceptance limits, every log against the baseline, what changed.
+    """Return the summary of a batch as blocks: counts, acceptance limits, comparison with the baseline, changes.
 
     Parameters
     ----------
     missing : logs of the baseline that the batch does not have
     """
-    # Not at import: a process that fits logs does not need these modules.
+    # Imported here, because a process that fits logs does not need these modules.
     from icrtool.output.exports.acceptance import limit_section
 
     errors, changes = [], changes_of(rows, missing)
@@ -266,7 +266,7 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
 
 
 def changes_of(rows: Sequence[FleetLog], missing: Sequence[str]) -> list[str]:
-    """Return how the logs, their configuration and the version differ from the baseline, a sentence each."""
+    """Return one sentence for each difference of logs, configuration and version from the baseline."""
     lines = [f"not in this batch, but in the baseline: {', '.join(missing)}"] if missing else []
     new = [row.log for row in rows if row.status != "failed" and not row.baseline]
     if new and len(new) < len(rows):
@@ -289,9 +289,9 @@ def pooled_calibrations(
 
     Parameters
     ----------
-    directory : of the batch, on disk; calibration files are written below it
-    place : address of the batch, where `directory` is its folder on disk; the runs are at this address
-    allow_unusable : also from runs that are not usable
+    directory : folder of the batch on disk; calibration files are written below it
+    place : address of a batch that is not on disk; the runs are at this address
+    allow_unusable : runs that are not usable are calibrated too
     """
     try:
         stored = {one.key: one for one in formats.read_fleet(directory).calibrations}
@@ -318,9 +318,10 @@ def pooled_calibrations(
 
 
 def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
-    """Return the usable runs of a batch by the name of their group: of the manifest, else of the robot.
+    """Return the usable runs of a batch by group: the group of the manifest, else the name of the robot.
 
-    Robots that are in the same group of the manifest are distinguished. Of copies in a group, the first one counts.
+    Different robots in one group of the manifest form different groups. Of copies of a log in a group, the first copy
+    counts.
 
     Raises
     ------
@@ -348,7 +349,7 @@ def _pooled(
     from icrtool.output.tables.calibration import held_out_blocks
     from icrtool.output.text_blocks import format_blocks
 
-    # A copy of a log would be tested on itself.
+    # A copy of a log would be tested with parameters that were fitted to the same log.
     distinct = {_content(row.inputs): row for row in reversed(members)}
     ordered = sorted(distinct.values(), key=lambda row: (row.start_utc, row.log))
     total_s = sum(row.duration_s or 0.0 for row in ordered)
@@ -388,5 +389,5 @@ def _pooled(
 
 
 def _content(inputs: Sequence[FleetFile]) -> tuple[str, ...]:
-    """Return the SHA-256 of each file of a log, equal for copies; for a file without one, its place and version."""
+    """Return the SHA-256 of each file of a log, equal for copies; place and version of a file without SHA-256."""
     return tuple(sorted(file.sha256 or f"at {file.path} {file.bytes} {file.version} {file.address}" for file in inputs))

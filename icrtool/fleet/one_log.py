@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from icrtool.records.dropout_document import ModelDocument
 
 FLEET_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
-"""Distances at which a batch collects errors [m]."""
+"""Distances of the errors in the tables of a batch [m]."""
 
 
 def path_from_bytes(name: bytes) -> Path:
@@ -47,18 +47,18 @@ def process_log(request: LogRequest, watch: Watch) -> FleetLog:
 
     Parameters
     ----------
-    watch : called with what is done next
+    watch : called with the name of each stage
     """
     begun = time.monotonic()
     path, folder = path_from_bytes(request.path), path_from_bytes(request.folder)
     try:
         row = _results(request, watch)
     except IcrToolError as err:
-        # A full disk may have space the next time, a log may be complete; errors of its content come again.
+        # A second attempt may find space on the disk, or a complete log. An error in the content would come again.
         reason = err.text_without(str(path), str(folder / request.known.run), log_name(path))
         row = row_of_failure(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
     except OSError as err:
-        # The log was removed meanwhile, or its disk fails.
+        # The log was removed during the work, or its disk fails.
         place = escaped(str(err.filename or path))
         row = row_of_failure(request, f"{place}: {err.strerror or err}", repeatable=False)
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
@@ -72,7 +72,7 @@ def process_log(request: LogRequest, watch: Watch) -> FleetLog:
 def row_of_failure(request: LogRequest, reason: str, *, details: str = "", repeatable: bool) -> FleetLog:
     """Return the row of a log that could not be processed."""
     inputs: tuple[FleetFile, ...] = ()
-    with suppress(OSError):  # a log that was removed meanwhile, or is a device
+    with suppress(OSError):  # the log was removed, or is a device
         inputs = files_of(path_from_bytes(request.path)) if repeatable else ()
     return replace(
         request.known, reason=reason, usable=False, details=details, repeatable=repeatable, inputs=inputs,
@@ -83,7 +83,7 @@ def row_of_failure(request: LogRequest, reason: str, *, details: str = "", repea
 def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, ...]:
     """Return the files of a log with their sha256; files in `inputs` are not read again.
 
-    For a log at an address only `inputs` is known.
+    For a log at an address only the files in `inputs` are known.
     """
     if isinstance(path, UrlPath):
         return tuple(
@@ -102,7 +102,7 @@ def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, .
 
 
 def _results(request: LogRequest, watch: Watch) -> FleetLog:
-    """Fit and analyse a log, write run and report, and return its row."""
+    """Fit and analyse a log, write run and report, and return the row of the log."""
     from icrtool.output.dropout_directory import open_baseline
 
     path, folder = path_from_bytes(request.path), path_from_bytes(request.folder)
@@ -146,7 +146,7 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
         events=len(summary.events),
         outages=len(report.outages),
         warnings=len(summary.warnings),
-        # A row is sent between processes as plain text: msgspec encodes no `LogText`.
+        # The row is sent to another process as JSON, and msgspec does not encode a `LogText`.
         notes=tuple(
             replace(one, subject=str.__str__(one.subject), text=str.__str__(one.text)) for one in summary.notes
         ),
@@ -158,14 +158,14 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
 
 
 def _calibration_of(input_file: CalibrationInput) -> Calibration:
-    """Read a calibration file, whose digest is in the key of the row.
+    """Return the calibration in a file of a batch.
 
     Raises
     ------
     OSError
-        It was removed.
+        The file was removed.
     LogChangedError
-        It is not as it was when the batch began.
+        The file changed since the batch began; the key of the row holds the SHA-256 of the former content.
     """
     from icrtool.output.files.formats import open_calibration
 
@@ -176,7 +176,7 @@ def _calibration_of(input_file: CalibrationInput) -> Calibration:
 
 
 def _errors(models: Iterable[ModelDocument]) -> dict[str, float | None]:
-    """Return p95 and expected errors of the models of a report, by the names of columns, and intervals of p95."""
+    """Return p95, its interval, and the expected error of each model of a report [m], by names of columns."""
     return {
         f"{one.name}_{metric}_{row.horizon_m:g}m_m": number
         for one in models

@@ -1,8 +1,8 @@
-"""Processes that work on logs: a process that hangs is killed, a process that dies costs one log.
+"""Processes that work on logs. A process that hangs is killed; a process that dies affects one log only.
 
-A process is started once and processes log after log, so that libraries and compiled code are loaded once. Requests
-travel as lines of JSON through its standard input, stages (texts) and rows (objects) through its standard output. The
-same function per log serves the threads of a batch on this machine and the threads of the workers of a cluster.
+A process works on one log after the other, so that it loads libraries and compiled code once. It reads requests from
+its standard input as lines of JSON, and writes stages (texts) and rows (objects) to its standard output. The threads of
+a batch on this machine and the threads of the workers of a cluster call the same function for each log.
 
 `pebble.ProcessPool` and `concurrent.futures` are not used: an exception that cannot be unpickled, or a process killed
 while it starts, ends all logs of their pools (pebble 5.2.3), and `concurrent.futures` has no time limit for a log.
@@ -41,52 +41,52 @@ if TYPE_CHECKING:
     from distributed import Client
 
 KILL_GRACE_S = 0.3
-"""Time in which a process may remove what it is writing before it is killed [s]."""
+"""Time in which a process may remove its unfinished files before it is killed [s]."""
 
 LONGEST_DETAILS = 4000
-"""Characters kept of the output of a process that died."""
+"""Largest length of the kept output of a process that died [characters]."""
 
 ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg",
     "MALLOC_ARENA_MAX": "1", "ARROW_DEFAULT_MEMORY_POOL": "system",
 }  # fmt: skip
-"""Environment of a process: one thread for each log, because several logs run at the same time; memory settings as in
-`icrtool.cli.main`."""
+"""Environment variables of a process. Libraries use one thread, because several logs are processed at the same time;
+the settings of memory are the settings in `icrtool.cli.main`."""
 
 NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
-"""Environment variable that Dask sets for its workers, and that our processes do not get: with it, memory goes back to
-the system again and again, which doubles system time."""
+"""Environment variable that Dask sets for its workers. Processes of a batch do not get it: it makes glibc give memory
+back to the system again and again, which doubles the system time."""
 
 PROCESS_COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.processes")
 
 Lines = queue.SimpleQueue[bytes]
 
 Lost = Callable[[], str]
-"""Returns why no log can be processed any more (a scheduler that is gone); empty while they can."""
+"""Function that returns why no log can be processed any more, for example a lost scheduler; else an empty text."""
 
 PROCESS_BYTES = 400 << 20
-"""Memory of a process with a small log [bytes]."""
+"""Memory that a process needs for a small log [bytes]."""
 
 LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
-"""Memory of a log: `LOG_FACTOR` times its size, at most `LOG_BYTES`, the memory of 10 h at 100 Hz."""
+"""Memory that a log needs: `LOG_FACTOR` times its size, at most `LOG_BYTES` [bytes], the memory of 10 h at 100 Hz."""
 
 _ANSWER: msgspec.json.Decoder[str | FleetLog] = msgspec.json.Decoder(str | FleetLog)
-"""Made at import: msgspec crashes where several threads are the first to use a type."""
+"""Decoder of answers, made at import, because msgspec crashes if several threads use a type for the first time."""
 
 _over = threading.Event()
 _all: set[Worker] = set()
 _idle: list[Worker] = []
-"""Processes that wait for a log; each thread that asks takes one, or starts one."""
+"""Processes that wait for a log. A thread with a log takes one of these processes, or starts a new process."""
 
 
 def process_apart(request: bytes, timeout_s: float, watch: Watch = unwatched) -> FleetLog:
-    """Process a log in a process of its own; if the process hangs or dies, the row states the reason.
+    """Return the row of a log, made by a separate process; the row states the reason if that process hangs or dies.
 
     Parameters
     ----------
-    request : of `LogRequest.encode`
-    timeout_s : after which the process is killed
-    watch : called with what is done next, where the caller is on the same machine
+    request : result of `LogRequest.encode`
+    timeout_s : time after which the process is killed [s]
+    watch : called with the name of each stage, if the caller is on the same machine
     """
     if _over.is_set():
         raise CancelledError
@@ -101,7 +101,7 @@ def process_apart(request: bytes, timeout_s: float, watch: Watch = unwatched) ->
 
 
 def end_for_good() -> None:
-    """End all worker processes, and let none be started: this process is about to end."""
+    """End all worker processes, and prevent that new ones are started, because this process is about to end."""
     _over.set()
     close_all()
 
@@ -124,14 +124,14 @@ def executor_of(
 
     Parameters
     ----------
-    jobs : logs at the same time on this machine; default: as `default_jobs`
+    jobs : number of logs that are processed at the same time on this machine; default: `default_jobs`
     scheduler : address of the cluster; None: this machine
     worker_timeout_s : a cluster without scheduler or worker for this time [s] is lost
 
     Raises
     ------
     ConfigError
-        There is no such cluster, or no Dask.
+        The cluster cannot be reached, or Dask is not installed.
     """
     if scheduler is None:
         try:
@@ -152,7 +152,7 @@ def executor_of(
     except (OSError, ValueError) as err:
         raise ConfigError(f"--scheduler {scheduler}", "no Dask scheduler answers there", str(err)) from err
     with client:
-        # A shutdown that waits would wait for ever for the logs of a lost cluster; all other logs are done by then.
+        # All other logs are done at this point. A shutdown that waits would never end if the cluster is lost.
         yield client.get_executor(), _loss_of(client, worker_timeout_s)
 
 
@@ -179,7 +179,7 @@ def _loss_of(client: Client, worker_timeout_s: float) -> Lost:
 
 
 def default_jobs(logs: Sequence[Path]) -> int:
-    """Return the number of cores, or of the largest logs that the free memory holds at once."""
+    """Return the smallest of the numbers of cores, of logs, and of largest logs that fit into the free memory."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     sizes = [sum(file.stat().st_size for file in files_of_log(log) if file.is_file()) for log in logs]
     largest = max(sizes, default=0)
@@ -205,7 +205,7 @@ class Worker:
         home = str(Path(__file__).resolve().parents[2])
         paths = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH")]))
         inherited = {name: value for name, value in os.environ.items() if name != NOT_INHERITED}
-        # In a session of its own: Ctrl-C reaches the command, which ends its workers.
+        # In a new session, so that Ctrl-C reaches only the command, which then ends its workers.
         self._process = subprocess.Popen(  # noqa: S603 - our own command
             PROCESS_COMMAND,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
@@ -214,12 +214,12 @@ class Worker:
         assert self._process.stdin is not None  # noqa: S101 - for the type checker
         assert self._process.stdout is not None  # noqa: S101 - as above
         self._requests = self._process.stdin
-        # At the end of the output, a line that is no answer.
+        # This line, which is no answer, marks the end of the output.
         self._answers = _lines_of(self._process.stdout, lambda lines: lines.put(b""))
         _all.add(self)
 
     def run(self, request: LogRequest, timeout_s: float, watch: Watch) -> FleetLog:
-        """Process a log, as `process_apart`."""
+        """Return the row of a log; arguments as in `process_apart`."""
         begun, begin_of_errors = time.monotonic(), self._errors.seek(0, os.SEEK_END)
         why = details = ""
         try:
@@ -233,9 +233,9 @@ class Worker:
                 watch(answer)
         except queue.Empty:
             why = f"took longer than {timeout_s:g} s and was ended"
-        except (OSError, ValueError):  # it died, perhaps in the middle of a line
+        except (OSError, ValueError):  # the process died, perhaps in the middle of a line
             why = self._how_it_ended()
-            with suppress(ValueError):  # closed, where the batch was interrupted
+            with suppress(ValueError):  # the pipe is closed after an interruption of the batch
                 self._errors.seek(begin_of_errors)
                 details = self._errors.read().decode(errors="replace").strip()[-LONGEST_DETAILS:]
             why += f": {details.splitlines()[-1]}" if details else ""
@@ -244,12 +244,12 @@ class Worker:
         return replace(row_of_failure(request, why, details=details, repeatable=False), took_s=took_s)
 
     def ask_to_end(self) -> None:
-        """Close its input: the process removes unfinished files and ends."""
-        with suppress(OSError):  # its other end is gone
+        """Close the input of the process, which then removes its unfinished files and ends."""
+        with suppress(OSError):  # the process has ended
             self._requests.close()
 
     def close(self, grace_s: float = KILL_GRACE_S) -> None:
-        """End the process; after `grace_s` it is killed."""
+        """End the process; kill it if it has not ended after `grace_s`."""
         _all.discard(self)
         self.ask_to_end()
         with suppress(subprocess.TimeoutExpired):
@@ -270,7 +270,7 @@ class Worker:
 
 
 def _lines_of(stream: IO[bytes], at_end: Callable[[Lines], object]) -> Lines:
-    """Return a queue that a thread of its own fills with the lines of a stream."""
+    """Return a queue that a new thread fills with the lines of a stream."""
     lines: Lines = queue.SimpleQueue()
 
     def read() -> None:
@@ -285,8 +285,8 @@ def _lines_of(stream: IO[bytes], at_end: Callable[[Lines], object]) -> Lines:
 
 def main() -> None:
     """Process the logs that standard input asks for, until it ends."""
-    # What a library prints goes to standard error. The files are opened anew, because a thread that waits for a line
-    # locks Python's own.
+    # Output of libraries goes to standard error. Both files are opened again, because a thread that waits for a line
+    # locks Python's standard input.
     requests, output = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -297,7 +297,7 @@ def main() -> None:
         output.flush()
 
     def end(_: Lines) -> None:
-        # The process that asked has ended, or ends this one, perhaps in the middle of a log.
+        # The parent process has ended, or ends this process, perhaps in the middle of a log.
         remove_unfinished()
         os._exit(1)
 

@@ -1,4 +1,4 @@
-"""The logs of a batch: recordings in files and folders, found by content, a name for the run of each; manifests.
+"""The logs of a batch: recordings found by content in files and folders, the names of their runs, and manifests.
 
 A manifest states which logs are of which robot, with which configuration, in which group (CSV or TOML).
 """
@@ -38,10 +38,10 @@ from icrtool.output.run_directory import RUN_FILE
 from icrtool.records.places import UrlPath, place_of, read_regular
 
 OWN_FILES = (RUN_FILE, "fleet.json", "study.json")
-"""A folder that holds one of these is a result, not a place of recordings."""
+"""Names of files by which a folder is recognised as a result of icrtool, in which no recordings are searched."""
 
 LONGEST_RESTART_S = 60.0
-"""Longest pause of a recorder that was restarted [s]; two drives are further apart."""
+"""Longest pause between two files of a restarted recorder [s]. Files after a longer pause are separate drives."""
 
 SQLITE_PAGE_BYTES = 65536
 """Length of the longest first page of an SQLite file, which names its tables [bytes]."""
@@ -53,9 +53,9 @@ class FoundRecording:
 
     Attributes
     ----------
-    path : as `icrtool.read_log` takes it
-    name : path of its run below ``runs/``, unique in the batch
-    log : path below the common parent of what was searched, as tables show it
+    path : argument for `icrtool.read_log`
+    name : path of the run below ``runs/``, unique in the batch
+    log : path below the common parent of the searched places, as tables show it
     """
 
     path: Path
@@ -88,10 +88,11 @@ def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
 
 
 def join_split_recordings(logs: Mapping[str, Path]) -> dict[str, Path]:
-    """Return recordings in which the files of a split recording, or of a restarted recorder, are joined to one.
+    """Return recordings in which the files of a split recording, or of a restarted recorder, are joined.
 
-    They are files of one folder whose names differ only in a count or a date, that have the same topics, and of which
-    each begins at most `LONGEST_RESTART_S` after the end of the one before it. A file without index has no known end.
+    Files are joined if they lie in one folder, their names differ only in a count or a date, they have the same topics,
+    and each begins at most `LONGEST_RESTART_S` after the end of the file before it. A file without index is not joined,
+    because its end is not known.
 
     Parameters
     ----------
@@ -131,7 +132,7 @@ def _consecutive(files: Sequence[NumberedFile]) -> list[list[Path]]:
 
 
 def _extent(path: Path) -> tuple[int, int, frozenset[tuple[str, str]]] | None:
-    """Return begin and end of a file [ns], by its index, and its topics with their types; None: it has no index."""
+    """Return begin and end [ns] of a file by its index, and its topics with types; None for a file without index."""
     try:
         container = open_log(path)
     except LogError:
@@ -145,9 +146,8 @@ def _extent(path: Path) -> tuple[int, int, frozenset[tuple[str, str]]] | None:
 def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Return the logs that a command is to use, each once, and the files among the places that are no logs.
 
-    A folder that is no recording and no run stands for the recordings below it, if there are any. A file that only has
-    the name of a recording among `places` (``drive.json`` next to ``drive.mcap``, from a pattern of the shell) is left
-    out.
+    A folder that is neither a recording nor a run is replaced by the recordings below it, if there are any. A pattern
+    of the shell may also name ``drive.json`` next to ``drive.mcap``: such a file is no log.
     """
     by_path: dict[str, Path] = {}
     for place in places:
@@ -172,7 +172,7 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def distinct_names(logs: Sequence[Path]) -> list[str]:
-    """Return a name for the run of each log: the log's name, or where two logs share it, what their paths differ in."""
+    """Return a name for the run of each log: the name of the log, or for equal names the differing part of the path."""
     names = [log_name(log) for log in logs]
     if len({name.casefold() for name in names}) == len(names):
         return names
@@ -234,7 +234,7 @@ def _named(paths: Sequence[Path], root: Path) -> list[FoundRecording]:
     """Name each recording after its path below `root`; where names collide, with the suffix of the file."""
     logs = [PurePosixPath(Path(os.path.relpath(_absolute(path), root)).as_posix()) for path in paths]
     short = [str(log.parent / log_name(path)) for log, path in zip(logs, paths, strict=True)]
-    # A run cannot lie in another run either.
+    # A run cannot lie in another run.
     count = Counter(name.casefold() for name in short)
     parents = {str(parent).casefold() for name in short for parent in PurePosixPath(name).parents}
     names = [
@@ -249,7 +249,7 @@ def _named(paths: Sequence[Path], root: Path) -> list[FoundRecording]:
 
 
 def unique_name(name: str, taken: set[str]) -> str:
-    """Return a name, with a number where it is taken; add it to the taken names."""
+    """Return a name that is not taken, with a number where needed, and add it to the taken names."""
     unique, number = name, 2
     while unique.casefold() in taken:
         unique, number = f"{name}-{number}", number + 1
@@ -264,7 +264,7 @@ def _absolute(path: Path) -> Path:
 
 
 def as_text(path: object) -> str:
-    """Return a path as text that every file takes: bytes of its name that are no UTF-8 as escapes."""
+    """Return a path as valid UTF-8 text; other bytes of its name become escapes."""
     return str(path).encode("utf-8", errors="backslashreplace").decode()
 
 
@@ -277,11 +277,11 @@ LARGEST_MANIFEST_BYTES = 10_000_000
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a manifest states about a log.
+    """The statements of a manifest about a log.
 
     Attributes
     ----------
-    robot : a built-in robot, or the name of one that `config` describes
+    robot : name of a built-in robot, or of the robot that `config` describes
     config : configuration file
     """
 
@@ -292,7 +292,7 @@ class About:
 
 
 class _Line(msgspec.Struct, forbid_unknown_fields=True):
-    """A line as it is written."""
+    """A line of a manifest as the user wrote it."""
 
     log: Annotated[str, msgspec.Meta(min_length=1)]
     robot: str = ""
@@ -303,9 +303,9 @@ class _Line(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class ManifestEntry:
-    """One line of a manifest: the files and folders that its pattern matches, and what holds for them.
+    """One line of a manifest: the files and folders that its pattern matches, and the statements about them.
 
-    `targets` are the places with links followed.
+    `targets` are the real paths of the places, with links followed.
     """
 
     places: tuple[Path, ...]
@@ -319,14 +319,14 @@ def is_manifest(path: Path) -> bool:
 
 
 def read_manifest(path: Path) -> list[ManifestEntry]:
-    """Read a manifest: CSV with the columns of `MANIFEST_COLUMNS`, or TOML with a table ``[[logs]]`` for each line.
+    """Return the lines of a manifest: CSV with the columns `MANIFEST_COLUMNS`, or TOML with tables ``[[logs]]``.
 
     Paths and patterns are relative to the manifest's folder. Tags in a CSV are separated by semicolons.
 
     Raises
     ------
     ConfigError
-        It cannot be read, has an unknown column, a log that does not exist or a pattern that matches nothing.
+        The manifest cannot be read, or has an unknown column, a missing log, or a pattern that matches nothing.
     """
     try:
         text = read_regular(path, most_bytes=LARGEST_MANIFEST_BYTES).decode("utf-8-sig")
@@ -347,7 +347,7 @@ def read_manifest(path: Path) -> list[ManifestEntry]:
 
 
 def about_recording(path: Path, entries: Sequence[ManifestEntry]) -> About:
-    """Return what a manifest states about a recording; a later line adds to and replaces an earlier one."""
+    """Return the statements of a manifest about a recording; later lines replace earlier values and add tags."""
     about = About()
     whole = _target(path)
     around = {whole, *whole.parents}
@@ -359,7 +359,7 @@ def about_recording(path: Path, entries: Sequence[ManifestEntry]) -> About:
 
 
 def _target(place: Path) -> Path:
-    """Return a place with links followed."""
+    """Return the real path of a place, with links followed."""
     return place if isinstance(place, UrlPath) else place.resolve()
 
 
@@ -391,7 +391,7 @@ def _entry(path: Path, row: Mapping[str, Any]) -> ManifestEntry:
 
 
 def _matching(path: Path, pattern: str) -> tuple[Path, ...]:
-    """Return what a pattern matches; a file whose own name has a bracket or a star is taken as it is."""
+    """Return the files and folders that a pattern matches; an existing file with this name comes before the pattern."""
     if isinstance(address := place_of(pattern), UrlPath):
         return tuple(find_logs_at(address))
     full_pattern = path.parent / pattern
