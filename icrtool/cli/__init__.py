@@ -1,9 +1,9 @@
 """The command line: the only package that uses click, and the only error boundary.
 
-At Ctrl-C and SIGTERM what is half written is removed, and the process ends at once. No exception is raised: in the
-middle of an import it could leave the import lock held, and in llvmlite's bookkeeping it is lost. The interpreter calls
-a handler only after the compiled loop, or the call of a library, that the main thread is in; where that takes too long,
-a second thread does the same.
+At Ctrl-C and SIGTERM unfinished files are removed, and the process ends at once. No exception is raised: an exception
+during an import could leave the import lock held, and llvmlite may drop it. The interpreter calls a signal handler only
+after the compiled loop or the library call of the main thread has returned; if that takes too long, a second thread
+ends the process.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a program that Ctrl-C ended."""
 
 SIGNAL_GRACE_S = 0.5
-"""Time in which the main thread may end the process, and the processes of a batch, after a signal [s]."""
+"""Time after a signal in which the main thread may end the process and the processes of a batch [s]."""
 
 OVER = 0
-"""Stands for the end of the block where the number of a signal is read."""
+"""Number that marks the end of the block, in the pipe from which the numbers of signals are read."""
 
 
 def main() -> None:
-    """Run the command line; the one place where errors become text and an exit code."""
-    # BLAS is given small matrices only (a dozen columns): its threads take more time to start than they would save.
+    """Run the command line. This is the only function that converts errors to a text and an exit status."""
+    # BLAS gets only small matrices (a dozen columns): its threads take more time to start than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Kernels of small loops run as fast, and compile in three quarters of the time.
+    # With this setting kernels of small loops run as fast, and compile in three quarters of the time.
     os.environ.setdefault("NUMBA_OPT", "1")
-    # What pyarrow frees is given back with the rest.
+    # With this setting the memory that pyarrow frees is given back with all other freed memory.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
-    # No figure is shown, and matplotlib cannot be imported where this names no backend.
+    # No figure is shown, and an invalid MPLBACKEND of the user would stop the import of matplotlib.
     os.environ["MPLBACKEND"] = "agg"
     if len(sys.argv) > 2:
-        # Before the first thread starts; not where only help is asked for, since it takes some milliseconds.
+        # Called before the first thread starts. It takes some milliseconds, so a call for help alone leaves it out.
         keep_freed()
-    # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
-    # numba and matplotlib, and of drawing. What a command loads is less than so many.
+    # Few objects of a command form cycles. A garbage collection every 700 objects costs a tenth of the time of loading
+    # numba and matplotlib, and of drawing. A command loads fewer objects than this threshold.
     gc.set_threshold(300_000)
     with suppress(ImportError, ValueError, OSError):
         # A recording split every minute has more files than a process may open; on Windows there is no such limit.
@@ -64,7 +64,7 @@ def main() -> None:
         if output.lost:
             sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
             status = status or 1
-    # At its end the interpreter looks for cyclic rubbish among all that was imported: a tenth of a second or two.
+    # Without this call the interpreter collects garbage among all imported objects at its end, in 0.1 to 0.2 s.
     gc.freeze()
     sys.exit(status)
 
@@ -89,11 +89,11 @@ def _run() -> int:
             from icrtool.cli.printing import print_error
             from icrtool.records.text import LogText
 
-            # A path that is too long, or on a disk that fails, where no command knows more about it.
+            # For example a path that is too long, or a disk that fails, of which no command reports more.
             print_error(f"{LogText(str(err.filename))}: {err.strerror}" if isinstance(err, OSError) else str(err))
             return 1
         except (MemoryError, ImportError, SystemError) as err:
-            # without memory, a library or a module may be loaded in part only
+            # after a lack of memory, a library or a module may be loaded only in part
             if not (isinstance(err, MemoryError) or _memory_is_limited()):
                 raise
             advice = "give it more (ulimit -v), or read a part of the log (--from, --to)"
@@ -109,7 +109,7 @@ def _run() -> int:
     except KeyboardInterrupt:
         sys.stderr.write("Aborted!\n")
         return INTERRUPTED
-    # Asked for help, click returns a status; a command returns nothing.
+    # click returns a status after help, and None after a command.
     return status if isinstance(status, int) else 0
 
 
@@ -123,11 +123,11 @@ def _memory_is_limited() -> bool:
 
 
 class _Unloaded:
-    """Finds the modules of icrtool, each to be loaded at the first use of a name in it; packages at once."""
+    """Finder of the modules of icrtool. A module is loaded at the first use of a name in it, a package at once."""
 
     @staticmethod
     def find_spec(fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return how a module is loaded; None of those of others."""
+        """Return how a module is loaded; None for modules of other packages."""
         spec = PathFinder.find_spec(fullname, path, target) if fullname.startswith("icrtool.") else None
         if spec is not None and spec.loader is not None and spec.submodule_search_locations is None:
             spec.loader = LazyLoader(spec.loader)
@@ -136,10 +136,11 @@ class _Unloaded:
 
 @contextmanager
 def when_used() -> Iterator[None]:
-    """Have what the block imports (``from icrtool.output import series``) loaded when it is used first.
+    """Load the modules that the block imports (``from icrtool.output import series``) only at their first use.
 
-    So the help of a command loads no numpy, pandas or pyarrow. Two threads must not be the first to use a module.
-    Packages are loaded at once: `icrtool.output.figures`, which loads matplotlib, is imported where it is used.
+    The help of a command then loads no numpy, pandas or pyarrow. The first use of a module must not happen in two
+    threads at the same time. Packages are loaded at once, so `icrtool.output.figures`, which loads matplotlib, is
+    imported in the functions that use it.
     """
     sys.meta_path.insert(sys.meta_path.index(PathFinder), _Unloaded)
     try:
@@ -150,9 +151,9 @@ def when_used() -> Iterator[None]:
 
 @contextmanager
 def end_at_once() -> Iterator[None]:
-    """Have the signals of `ENDING` end the process with the status 128 and their number; on Windows nothing changes.
+    """Let the signals of `ENDING` end the process, with 128 plus the number of the signal as status; not on Windows.
 
-    SIGHUP comes where a terminal is closed.
+    A process gets SIGHUP when its terminal is closed.
     """
     if threading.current_thread() is not threading.main_thread() or sys.platform == "win32":
         yield
@@ -163,7 +164,7 @@ def end_at_once() -> Iterator[None]:
     os.set_blocking(signalled, False)
     over = threading.Event()
     threading.Thread(target=_watch, args=(arrived, over), name="interrupts", daemon=True).start()
-    # The system's handler of a signal writes its number there at once, whatever the interpreter is doing.
+    # The signal handler in C writes the number of the signal to this pipe at once, even during a library call.
     before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
     for number in handled:
         signal.signal(number, _end)
@@ -174,13 +175,13 @@ def end_at_once() -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL)
         signal.set_wakeup_fd(before)
         over.set()
-        # The end of the pipe would not be enough: a forked process has a copy of this side.
+        # Closing the pipe is not enough, because a forked process has a copy of this end.
         os.write(signalled, bytes([OVER]))
         os.close(signalled)
 
 
 def _watch(arrived: int, over: threading.Event) -> None:
-    """Wait for one of these signals, and end the process where the main thread does not."""
+    """Wait for a signal of `ENDING`, and end the process if the main thread does not end it in `SIGNAL_GRACE_S`."""
     while (number := os.read(arrived, 1)[0]) != OVER:
         if number in ENDING and not over.wait(SIGNAL_GRACE_S):
             _end(number)
@@ -188,14 +189,14 @@ def _watch(arrived: int, over: threading.Event) -> None:
 
 
 def _end(number: int, frame: FrameType | None = None) -> None:
-    """Remove what this process is writing, and end it and its worker processes, whatever its threads do."""
+    """Remove the unfinished files of this process, and end the process, its threads and its worker processes."""
     if frame is not None and not may_end():
         return  # `_watch` ends it
-    # No import here: the main thread may hold its lock.
+    # No import here, because the main thread may hold the import lock.
     if (processes := sys.modules.get("icrtool.fleet.processes")) is not None:
         processes.end_for_good()
     remove_unfinished()
-    with suppress(OSError, ValueError, RuntimeError):  # RuntimeError: it was just being written
+    with suppress(OSError, ValueError, RuntimeError):  # RuntimeError: the stream is being written at this moment
         sys.stdout.flush()
     with suppress(OSError):
         if number == signal.SIGINT:
@@ -208,7 +209,7 @@ class Stream:
 
     Attributes
     ----------
-    lost : why something could not be written; empty where nothing was lost, and where a reader had enough (a pipe)
+    lost : why text was lost; empty where nothing was lost, and where the reader of a pipe closed it
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -219,11 +220,11 @@ class Stream:
         return getattr(self._stream, name)
 
     def isatty(self) -> bool:
-        """Return whether it is a terminal; a stream that was closed is none."""
+        """Return whether the stream is a terminal; False for a closed stream."""
         return self._stream is not None and self._stream.isatty()
 
     def write(self, text: str) -> int:
-        """Write a text, or drop it."""
+        """Write a text; drop the text if it cannot be written."""
         if self._stream is None:
             self.lost = os.strerror(errno.EBADF)
             return len(text)
@@ -234,7 +235,7 @@ class Stream:
             return len(text)
 
     def flush(self) -> None:
-        """Write what is held back, or drop it."""
+        """Write the buffered text; drop it if it cannot be written."""
         try:
             if self._stream is not None:
                 self._stream.flush()
@@ -244,7 +245,7 @@ class Stream:
     def _drop(self, err: OSError) -> None:
         if err.errno != errno.EPIPE:
             self.lost = err.strerror or str(err)
-        # Buffered text is dropped, too: the interpreter would fail with the same error when it ends.
+        # Buffered text is dropped too, because the interpreter would fail with the same error at its end.
         with suppress(OSError, ValueError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, cast(TextIO, self._stream).fileno())
@@ -253,7 +254,7 @@ class Stream:
 
 @contextmanager
 def standard_streams() -> Iterator[Stream]:
-    """Put streams that may go away in the place of standard output and error; give that of the output."""
+    """Replace standard output and error by streams that may fail; yield the stream of standard output."""
     before = sys.stdout, sys.stderr
     for stream in before:
         # A terminal that cannot show a degree sign gets a question mark, not a traceback.

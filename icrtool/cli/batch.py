@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from icrtool.records.requests import BatchRequest, LogRequest
 
 LONGEST_STAGE, LEAST_NAME = 28, 12
-"""Characters of the live line for the stage of a log with its separators, and for its name at least."""
+"""Lengths in the live line [characters]: of the stage of a log with its separators, and at least of the log's name."""
 
 
 class Workers(NamedTuple):
-    """Where logs are processed, as `icrtool.fleet.processes.executor_of` takes it."""
+    """The executor of a batch: arguments of `icrtool.fleet.processes.executor_of`."""
 
     jobs: int | None = None
     scheduler: str | None = None
@@ -131,13 +131,13 @@ def batch_command(
 def run_all(
     requests: Sequence[LogRequest], workers: Workers, batch: BatchRequest, view: View, folder: Path
 ) -> list[FleetLog]:
-    """Process all logs, and return a row of each, in the order of the requests.
+    """Process all logs, and return the row of each log, in the order of the requests.
 
     Parameters
     ----------
-    folder : on disk, that stands for the place of the results
+    folder : folder on disk with the results; an address of the results is written from it
     """
-    # Not one of those that are loaded when used: at a signal, nothing can be loaded any more.
+    # Imported at once, not at the first use: at a signal no module can be loaded any more.
     from icrtool.fleet.processes import executor_of
 
     rows: list[FleetLog] = []
@@ -154,7 +154,7 @@ def run_all(
 
 
 class View(LiveLine):
-    """What is shown of a batch while it runs: a line per log, and on a terminal a line about those that run."""
+    """Output of a running batch: a line for each finished log, and on a terminal a line about the running logs."""
 
     def __init__(self, logs: int, printer: Printer) -> None:
         super().__init__(quiet=printer.quiet)
@@ -164,7 +164,7 @@ class View(LiveLine):
         self._counts: Counter[str] = Counter()
         self._processed = 0
         self._stages: dict[str, str] = {}
-        # Stages come from threads of the logs: none may write between the removal of the line and a result.
+        # Stages come from the threads of the logs. No thread may write between the removal of the line and a result.
         self._lock = RLock()
 
     def stage(self, log: str, stage: str) -> None:
@@ -216,14 +216,14 @@ class View(LiveLine):
 
 
 def line_of(row: FleetLog) -> str:
-    """Return a line about a log that could be used."""
+    """Return the printed line about a log that could be used."""
     is_cut = row.usable and "log_cut_off" in row.codes
     word = "skipped" if row.this_time == "skipped" else "cut off" if is_cut else row.status
     parts = [f"{word:7}", str(LogText(row.log))]
     if row.distance_m is not None:
         parts.append(f"{row.distance_m:.0f} m")
     if not row.usable:
-        # the first cause, without its numbers; all of it stands in fleet.csv
+        # the first cause without its numbers; fleet.csv has the whole text
         cause = next((one.finding for one in row.notes if notes.is_grave(one)), "")
         return "  ".join([*parts, f"do not use: {escaped(cause)}"])
     if row.multiplier is not None:
@@ -234,7 +234,7 @@ def line_of(row: FleetLog) -> str:
 
 
 def summary_of(rows: Sequence[FleetLog], output: Path, written: str) -> str:
-    """Return the last line: how many logs were done or failed, and where the tables are."""
+    """Return the last line of a batch: numbers of logs that were done and failed, and the place of the tables."""
     parts = [fleet_files.counts_text(rows)]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []

@@ -1,4 +1,4 @@
-"""``icrtool calibrate``, and ``icrtool forecast`` with what it found."""
+"""``icrtool calibrate``, and ``icrtool forecast`` with the resulting calibration."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def calibrate_command(
     if output is not None:
         formats.calibration_file(output)
     if plot is not None and run_directory.is_run_directory(places[0]):
-        # A run may come from a stranger: no file or address is read because it names one.
+        # A run may come from a stranger, so no file or address that the run names is read.
         raise errors.RunError(places[0], "--plot draws the residuals of a log, not of a run", "name its log")
     if all(run_directory.is_run_directory(place) for place in places):
         check_run_config(config)
@@ -163,7 +163,7 @@ def forecast_command(
 def _forecasts(
     calibration: Calibration, path: Path, run: Run | None
 ) -> tuple[error_growth.Forecast, error_growth.Forecast | None]:
-    """Forecast along the path of a run, or the points of a table: wheels alone, and with a gyro where both have one."""
+    """Return forecasts along the path of a run or a table: by wheels alone and, if both have a gyro, with a gyro."""
     with_gyro = calibration.gyro is not None and calibration.gyro.error_sources is not None
     if run is not None:
         recording = pooled.turning_recording_of(run)

@@ -1,4 +1,4 @@
-"""The command group; a command's module is imported when it is called, so that ``--help`` is instant."""
+"""The command group. The module of a command is imported when the command is called, so that ``--help`` is instant."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ _COMMAND_MODULES = {
     "study": "simulate",
     **dict.fromkeys(("robots", "config", "cache", "completion"), "installation"),
 }
-"""Module of a command where that has another name."""
+"""Modules of the commands whose module has another name."""
 
 
 class _Commands(click.Group):
-    """Finds the commands in their modules, each as ``NAME_command``."""
+    """Command group that finds each command in its module, as ``NAME_command``."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)

@@ -40,7 +40,7 @@ EPILOG_GATE = (
 
 
 def read_horizons(text: str) -> tuple[float, ...]:
-    """Read the distances [m] of ``--horizons``."""
+    """Return the distances [m] in the value of ``--horizons``."""
     metres = options.numbers_reader("M,M,...")(text)
     if min(metres) <= 0:
         raise click.BadParameter(f"{text!r} has a distance that is not above zero")
@@ -129,10 +129,10 @@ def dropout_report_command(
 def plan_sources(
     sources: tuple[Path, ...], place: ResultPlace, config: Config, printer: Printer
 ) -> tuple[tuple[Path, ...], dict[Path, Place]]:
-    """Return the sources, the newest run where none is named, and the run directory of each that is a log.
+    """Return the sources (the newest run if the user names none), and the run directory of each source that is a log.
 
-    Everything that can be refused without reading a log is refused here: a finished run keeps its configuration and
-    its place.
+    Requests that can be refused without reading a log are refused here, for example settings for a finished run, which
+    keeps its configuration and its place.
     """
     sources = logs_of(sources or (run_directory.newest_run(RUNS_FOLDER),), printer)
     logs = tuple(
@@ -150,7 +150,7 @@ def plan_sources(
 
 
 def content_of(log: Path) -> tuple[str, ...]:
-    """Return the SHA-256 of each file of a log on disk, in which a baseline finds it."""
+    """Return the SHA-256 of each file of a log on disk, by which a baseline finds the log."""
     if isinstance(log, UrlPath):
         return ()
     return tuple(recording_files.file_sha256(file) for file in recording_files.files_of_log(log) if file.is_file())
@@ -167,13 +167,13 @@ def report_one(
     source: Path, place: Place | None, config: Config, request: ReportRequest, files: ResultFiles,
     other_results: OtherResults, printer: Printer,
 ) -> DropoutReport:  # fmt: skip
-    """Report on one source; `place` is the run directory of a log, None for a run."""
+    """Return the report on one source; `place` is the run directory of a log, None for a run."""
     with ExitStack() as stack:
         if place is None:
             folder = stack.enter_context(remote_place.on_disk(source, needed=bool))
             run = run_directory.open_run(folder, whole=False)
         else:
-            # One result: where the report fails, an old run in this place stays, with its report.
+            # Run and report are one result: if the report fails, an older run in this place stays, with its report.
             run, folder = stack.enter_context(fitted_log(source, place, config, request.fit, files, printer))
         if request.outage_at_s and not dropout_report.forced_lengths_s(run, request):
             raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")

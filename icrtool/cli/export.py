@@ -32,7 +32,7 @@ LOCALIZATION = "robot_localization"
 EXPORT_TARGETS = (*CONTROLLERS, LOCALIZATION, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
 
 TEXT_SUFFIXES = (".txt", ".csv")
-"""Suffixes of a file for one trajectory, in addition to the formats. Other text after a dot belongs to the name."""
+"""Suffixes of a file with one trajectory, in addition to the names of formats. Other suffixes belong to the name."""
 
 _EXAMPLE_COMMANDS = (
     ("a controller", "diff_drive_controller", "clearpath, nav2, husarion", False),
@@ -42,7 +42,7 @@ _EXAMPLE_COMMANDS = (
     ("a map", "qgis -o map.geojson", "google-earth", True),
     ("a viewer", "foxglove -o view.mcap", "", True),
 )
-"""Who needs an export: name, target with options, further targets, and whether paths of a run are needed."""
+"""Programs that need an export: name, target with options, further targets, and whether paths of a run are needed."""
 
 ALL_THE_SAME = "--force exports it all the same"
 
@@ -80,7 +80,7 @@ def export_command(source: Path | None, target: str | None, output: Path | None,
     """  # noqa: D301 - click reads the escape
     target = _checked(target, source, output)
     if target in TRAJECTORIES and output is not None:
-        # A file by what is there, else by a suffix that such files have.
+        # An existing place decides between file and folder; for a new place the suffix decides.
         suffixes = (*paths.SUFFIXES.values(), *TEXT_SUFFIXES)
         if not (output.is_file() or (output.suffix.lower() in suffixes and not output.is_dir())):
             _write_trajectories(_run(source), cast(TrajectoryFormat, target), output)
@@ -109,7 +109,7 @@ def export_command(source: Path | None, target: str | None, output: Path | None,
 
 
 def _checked(target: str | None, source: Path | None, output: Path | None) -> str:
-    """Return the target; refuse a command without one, and a target that is not text without a file."""
+    """Return the target; refuse a command without a target, and a binary target without an output file."""
     if target is None:
         raise click.UsageError(_what_to_type(source))
     if target == "foxglove" and output is None:
@@ -118,7 +118,7 @@ def _checked(target: str | None, source: Path | None, output: Path | None) -> st
 
 
 def _what_to_type(source: Path | None) -> str:
-    """Return a command for each kind of program that an export can be for; a calibration has no paths."""
+    """Return an example command for each kind of program; without programs that need paths for a calibration."""
     name = "RUN" if source is None else shlex.quote(escaped(str(source)))
     of_run = source is None or source.is_dir()
     lines = [
@@ -152,7 +152,7 @@ def _write_foxglove(run: Run, output: Path) -> None:
 
 
 def _run(source: Path | None, output: Path | None = None) -> Run:
-    """Read the run whose paths are asked for; one that is not usable has them too. Its log is never the output."""
+    """Return the run whose paths are exported, even if it is not usable; refuse its log as the output."""
     if source is not None and is_log(source):
         advice = f"icrtool fit {escaped(str(source))} makes its run"
         raise errors.RunError(source, "is a log, and paths come from a run", advice)

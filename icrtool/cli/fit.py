@@ -1,4 +1,4 @@
-"""``icrtool fit`` and ``icrtool info``: what a log shows of its robot, written as a run or printed."""
+"""``icrtool fit``, which writes a run, and ``icrtool info``, which prints the content and the problems of a log."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def fit_command(
                 print_error(f"{run.name}: do not use this run: {run.document.unusable_because}")
             where = escaped(str(path_of(run_place)))
             document |= {"directory": where, "run": run.summary}
-            # The command that states what is wrong with the log.
+            # The next command reports the problems of the log.
             examine = shlex.join(
                 ["icrtool", "info", escaped(str(log)), "-v", *options.options_to_repeat(settings, request)]
             )
@@ -102,7 +102,7 @@ def fitted_log(
     log: Path, place: Place, config: Config, request: FitRequest, files: ResultFiles, printer: Printer,
     warm_start: Path | None = None, *, warns: bool = True,
 ) -> Iterator[tuple[Run, Path]]:  # fmt: skip
-    """Fit a log, and yield as `icrtool.pipeline.fit_into` does; with `warns`, print warnings and streams on stderr.
+    """Fit a log, and yield the run and its directory; with `warns`, print warnings and streams on standard error.
 
     A run with other settings is replaced only if `files.overwrite` is set.
     """
@@ -158,15 +158,15 @@ def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSo
 def _examine(
     log: Path, config: Config, request: FitRequest, options_given: list[str], document: dict[str, Any], printer: Printer
 ) -> None:
-    """Read and fit a log, and print whether it can be fitted, what it holds, and the command to run next.
+    """Read and fit a log, and print whether it can be fitted, its content, and the command to run next.
 
-    Only the filter shows which ICRs the drive determines, and which sensors disagree. `document` gets the same as plain
-    data; ``run`` as in run.json, null where the log cannot be fitted.
+    The filter runs, because only its result shows which ICRs the drive determines and which sensors disagree.
+    `document` gets the printed content as plain data, with ``run`` as in run.json, null if the log cannot be fitted.
 
     Raises
     ------
     IcrToolError
-        The log cannot be fitted; what was found up to there is printed.
+        The log cannot be fitted; the findings before the error are printed.
     """
     survey = measured = run = problem = None
     try:
@@ -182,7 +182,7 @@ def _examine(
     except errors.IcrToolError as err:
         problem = err
     holds = read_log.survey_document(survey) if survey is not None else None
-    # What errors and warnings of the log begin with: its name, or its path.
+    # Beginnings of errors and warnings about the log: its name, or its path.
     names = (survey.name if survey is not None else LogText(log.stem), escaped(str(log)))
     command = overview.next_command(escaped(str(log)), options_given, run)
     used = [stream.topic for stream in measured.streams if stream.role == "gnss"] if measured is not None else []

@@ -1,4 +1,4 @@
-"""What a command reads and where it writes: logs and runs among its arguments, and the directories of results."""
+"""Inputs and outputs of a command: logs and runs among its arguments, and the directories of results."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ RUNS_FOLDER = Path("icrtool-runs")
 
 
 def logs_of(places: tuple[Path, ...], printer: Printer) -> tuple[Path, ...]:
-    """Return the logs among the arguments of a command, those in folders too, and warn of files that are none."""
+    """Return the logs among the arguments of a command, also in folders, and warn of files that are no logs."""
     logs, others = recordings.logs_among(places)
     printer.warn(f"{escaped(str(file))}: not a log: left out" for file in others)
     return tuple(logs)
 
 
 def runs_or_logs(place: Path) -> list[Path]:
-    """Return the runs in a folder or, if it has none, its logs; a run or a log is returned itself."""
+    """Return the runs in a folder, or its logs if it has no runs; a run or a log is returned itself."""
     if not isinstance(place, UrlPath):
         if run_directory.is_run_directory(place) or not place.is_dir():
             return [place]
@@ -54,7 +54,7 @@ def runs_or_logs(place: Path) -> list[Path]:
 
 
 def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run]:
-    """Read runs, and fit logs with the filter alone, without a recommended model; nothing is written."""
+    """Return runs, read from their directories or made of logs without a recommended model; nothing is written."""
     runs = []
     with printer.progress("reading") as progress:
         for path in paths:
@@ -68,14 +68,14 @@ def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[
 
 
 def check_run_config(config: Config, *, free: str = "") -> None:
-    """Refuse settings for a finished run, except settings of section `free`, which a report may change."""
+    """Refuse settings for a finished run; a report may change settings of the section `free`."""
     if sections := sorted({key.partition(".")[0] for key in config.given} - {free}):
         advice = "fit the log again with it, or name the log in place of its run"
         raise errors.ConfigError(f"[{sections[0]}]", "a finished run keeps the configuration it was made with", advice)
 
 
 def is_log(source: Path) -> bool:
-    """Return whether an argument is to be read as a log: a file that is no JSON, a bag directory, an address."""
+    """Return whether an argument is read as a log: a file that is not JSON, a bag directory, or an address."""
     if isinstance(source, UrlPath):
         return not run_directory.is_run_directory(source)
     if source.is_file():
@@ -92,9 +92,9 @@ class ResultPlace(NamedTuple):
 
 
 def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[Place]:
-    """Return where each log's run goes: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` for several or `into`.
+    """Return the run directory of each log: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` in `into`.
 
-    Logs with the same name get names from the parts in which their paths differ.
+    ``DIR/NAME`` is also used for several logs. Logs of equal names get names from the differing parts of their paths.
     """
     output, into = place
     if output is not None and into is not None:
@@ -110,7 +110,7 @@ def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[Place]:
 
 
 def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:
-    """Return a calibration and its name: of a calibration file, or of a run, which is calibrated."""
+    """Return a calibration and its name: the content of a calibration file, or the calibration of a run."""
     return read_calibration_and_run(source, force=force, advice=advice)[:2]
 
 
@@ -133,7 +133,7 @@ def read_calibration_and_run(
 
 
 def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
-    """Return the places of each group; the only argument may be the folder of a batch, which has groups of its own.
+    """Return the places of each group by name; a single argument may be the folder of a batch, which has groups.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
 
 
 def _expanded(place: Path) -> list[Path]:
-    """Return the files of a pattern, which a shell does not expand after ``NAME=``; without one, the place itself."""
+    """Return the files that a pattern after ``NAME=`` matches, which no shell expands; else the place itself."""
     if isinstance(place, UrlPath) or place.exists() or not glob.has_magic(str(place)):
         return [place]
     files = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute
@@ -163,7 +163,7 @@ def _expanded(place: Path) -> list[Path]:
 
 
 def named_place(source: str) -> tuple[LogText, Path]:
-    """Return the group's name and the place of one argument of ``compare``."""
+    """Return the name of the group and the place in one argument of ``compare``."""
     whole = place_of(source)
     name, sign, place = source.partition("=")
     # An address may have an equals sign in its query.
@@ -173,9 +173,9 @@ def named_place(source: str) -> tuple[LogText, Path]:
 
 
 def grounds_of(sources: tuple[str, ...]) -> tuple[list[Path], list[str]]:
-    """Return the runs and logs of ``calibrate``, and the name of the ground of each; no names where none was given.
+    """Return the runs and logs of ``calibrate``, and the name of the ground of each; no names if the user gives none.
 
-    The only argument may be the folder of a batch, whose groups are the grounds.
+    A single argument may be the folder of a batch, whose groups are the grounds.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""``icrtool robots``, ``config``, ``cache`` and ``completion``: what an installation knows, and what is added to it."""
+"""``icrtool robots``, ``config``, ``cache`` and ``completion``: built-in robots, keys, compiled code, completion."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def compile_all(*, quiet: bool) -> None:
 
     begin = time.perf_counter()
     for module in pkgutil.walk_packages(icrtool.__path__, "icrtool."):
-        # Python keeps what it compiled of a module that is imported
+        # Python keeps the compiled code of an imported module
         importlib.import_module(module.name)
     place = writable_place()
     if place is None:
@@ -108,7 +108,7 @@ def compile_all(*, quiet: bool) -> None:
 
 
 def call_all_kernels() -> None:
-    """Call each kernel with the types that the commands call it with: drive a robot, fit, smooth, report and study."""
+    """Call each kernel with the types of arguments that the commands use: drive a robot, fit, smooth, report, study."""
     import numpy as np
 
     import icrtool
@@ -147,12 +147,12 @@ NO_BLANK_AFTER_EQUALS = """\
 
 
 class BashWithEquals(BashComplete):
-    """Completes ``--set key=value``: bash ends a word at ``=``, and replaces only what follows it."""
+    """Completion of ``--set key=value`` in bash, which ends a word at ``=`` and replaces only the text after it."""
 
     source_template = BashComplete.source_template.replace("    return 0\n", NO_BLANK_AFTER_EQUALS, 1)
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Return the words before the one to complete, and that one; words that bash cut at ``=`` are joined."""
+        """Return the words before the incomplete word, and this word; words that bash cut at ``=`` are joined."""
         args, incomplete = super().get_completion_args()
         rest, words = [*args, incomplete], [""]
         while rest:
@@ -166,14 +166,14 @@ class BashWithEquals(BashComplete):
         return words[1:-1], words[-1]
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return a completion without what stands before its ``=``."""
+        """Return a completion without the text up to its ``=``."""
         key, equals, value = item.value.partition("=")
         after = value if equals and value else f"{key}{equals}"
         return f"{item.type},{after}"
 
 
 def register_completion() -> None:
-    """Have click use the completion above; called before it looks whether a shell asks for one."""
+    """Register `BashWithEquals` in click. It is called before click answers a shell that asks for completions."""
     add_completion_class(BashWithEquals, "bash")
 
 

@@ -53,10 +53,10 @@ REQUESTS_MODULE = "icrtool.records.requests"
 
 
 class _Positive(click.FloatRange):
-    """A number above zero; a text with a unit is refused with the number to type."""
+    """Type of a number above zero. A text with a unit is refused, with the number to type in the message."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401 - as click has it
-        """Return the number, or fail with what to type."""
+        """Return the number; the error for another text states the number to type."""
         with_unit = re.fullmatch(r"\s*(\d*\.?\d+)\s*([a-zA-Zµ]+)\s*", value) if isinstance(value, str) else None
         if with_unit is None or with_unit[2].lower() in ("inf", "nan", "e"):
             return super().convert(value, param, ctx)
@@ -77,11 +77,11 @@ USUAL = (
     "output", "robot", "config", "set", "topics", "path", "duration", "speed", "seed", "runs", "jobs", "budget",
     "calibration", "gate", "baseline", "outage", "plots", "overwrite", "strict", "json", "quiet", "verbose", "help",
 )  # fmt: skip
-"""Names of the options that most calls need, in the order in which a help lists them."""
+"""Names of the options that most calls need, in the order in which the help lists them."""
 
 
 class GroupedCommand(click.Command):
-    """A command whose help lists its usual options first, and the rest under ``More options``."""
+    """Command whose help lists the usual options first, and the other options under ``More options``."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options of the help."""
@@ -105,14 +105,14 @@ def command(name: str, **further: Any) -> Callable[[Command], click.Command]:
 
 
 def option(names: str, metavar: str | None, kind: object, text: str, **further: Any) -> Option:
-    """Return an option with a value; a default is shown.
+    """Return an option with a value; the help shows its default.
 
     Parameters
     ----------
     names : as ``-o --output directory``: the last name, if it has no dash, is the name of the argument
     kind : type of the value, or the function that reads it
-    text : help
-    further : as click has it
+    text : text of the help
+    further : further arguments of `click.option`
     """
     further = {"show_default": further.get("default") is not None} | further
     return click.option(*names.split(), metavar=metavar, type=kind, help=text, **further)
@@ -133,7 +133,7 @@ def options_as_record(name: str, home: str | Callable[..., Any], *options: Optio
 
     Parameters
     ----------
-    name : of the argument
+    name : name of the argument
     home : type of the record, or its place as ``icrtool.config:ConfigSources``, which is imported when the command is
         called. An option with the name of a field sets this field, if the option is given. The command receives the
         other options
@@ -167,7 +167,7 @@ def add_options(command: Command, *options: Option) -> Command:
 
 
 def add_all(*options: Option) -> Option:
-    """Return several options as one."""
+    """Return a decorator that adds several options."""
     return lambda command: add_options(command, *options)
 
 
@@ -176,8 +176,8 @@ class _Path(click.Path):
 
     Parameters
     ----------
-    addresses : addresses are accepted. The reader of a log, not click, checks that it can be read, with its own message
-    check : place of a function (``module:function``) that refuses an unwritable place before any work is done
+    addresses : addresses are accepted. The reader of the log, not click, checks that the path can be read
+    check : name of a function (``module:function``) that refuses an unwritable place before any work is done
     """
 
     def __init__(self, *, addresses: bool = False, check: str = "") -> None:
@@ -187,7 +187,7 @@ class _Path(click.Path):
     def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Return the path."""
         if not os.fspath(value):
-            # It would be the current directory.
+            # An empty text would be the current directory.
             self.fail("an empty name: is a variable of the shell not set?", param, ctx)
         address = place_of(os.fspath(value))
         if isinstance(address, UrlPath):
@@ -208,7 +208,7 @@ NEW_PICTURE = _Path(check="icrtool.output.files.formats:check_picture")
 
 
 def numbers_reader(form: str, count: int | None = None) -> Callable[[str], tuple[float, ...]]:
-    """Return a function that reads numbers separated by commas; `form` is their form, for the error message."""
+    """Return a function that reads numbers separated by commas; the error message shows `form`."""
 
     def read(text: str) -> tuple[float, ...]:
         try:
@@ -232,7 +232,7 @@ def complete_robot(ctx: click.Context, param: click.Parameter, incomplete: str) 
 
 
 def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the keys that begin with `incomplete`, or the values of a key: its words, or the topics of the log."""
+    """Return the keys that begin with `incomplete`; after ``KEY=`` the words of the key, or the topics of the log."""
     key, equals, begun = incomplete.partition("=")
     section, _, name = key.partition(".")
     if not equals:
@@ -240,7 +240,7 @@ def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str
         keys = [(f"{one}.{two}", texts[one][two]["text"]) for one in config.SECTIONS for two in texts[one]]
         return [CompletionItem(f"{one}=", help=text) for one, text in keys if one.startswith(incomplete)]
     if section == "topics":
-        # Without the value of --set, click leaves what stands before it in `args`.
+        # click leaves the words before an incomplete --set in `args`.
         values = topics_of(ctx.params.get("logs") or ctx.params.get("sources") or ctx.args)
     else:
         values = config.words_of_key(section, name)
@@ -248,14 +248,15 @@ def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str
 
 
 def topics_of(logs: object) -> tuple[str, ...]:
-    """Return the topics of the logs that were named before, as far as they can be read and are names of ROS.
+    """Return the topics of the logs on the command line; only topics with valid ROS names.
 
-    Bash puts a completion into the line without quoting it: no other text of a log may come there.
+    Bash inserts a completion without quotes, so any other text of a log could be run as a command. Logs that cannot be
+    read are skipped.
     """
     topics: set[str] = set()
     for log in logs if isinstance(logs, tuple | list) else ():
         if log == "-":
-            continue  # a completion must not wait for its input
+            continue  # a completion must not wait for standard input
         try:
             container = open_log.open_log(Path(log))
         except errors.IcrToolError:
@@ -270,7 +271,7 @@ def _limit(variable: str, read: str) -> Callable[[click.Context, click.Parameter
 
     Parameters
     ----------
-    variable, read : names in `icrtool.records.input_limits`: of the variable, and of the function that reads its value
+    variable, read : names of the variable and of the function that reads its value, in `icrtool.records.input_limits`
     """
 
     def set_limit(context: click.Context, _option: click.Parameter, text: str | None) -> None:
@@ -332,7 +333,7 @@ VERBOSE_OPTION = flag("-v --verbose", "Print more details.")
 
 
 def printer_options(*options: Option) -> Option:
-    """Add some of the options above, as `printer`."""
+    """Add some of the options -q, -v and --json, as the argument `printer`."""
     return options_as_record("printer", Printer, *options)
 
 
@@ -340,7 +341,7 @@ SEED = option("--seed", None, click.IntRange(min=0), "Seed of all noise; the sam
 
 
 def plot_formats(text: str) -> tuple[str, ...]:
-    """Read ``png,svg,pdf`` or ``none``."""
+    """Return the formats in the value of ``--plots``: ``png,svg,pdf`` or ``none``."""
     asked = tuple(part.strip().lower() for part in text.split(",") if part.strip())
     if asked == ("none",):
         return ()
@@ -370,7 +371,7 @@ ALLOW_UNUSABLE = flag("--allow-unusable", "Give distances and numbers of runs th
 
 
 def _split_gates(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the limits, one per line of each text. A blank text is kept, so that it is refused as an invalid limit."""
+    """Return the limits in the lines of each text. A blank text is kept, and is refused later as an invalid limit."""
     lines = tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
     for line in lines:
         try:
@@ -391,7 +392,7 @@ class Exports(NamedTuple):
     markdown: Path | None = None
 
     def write(self, command: str, suites: Callable[[], Sequence[acceptance.Suite]], text: Callable[[], str]) -> None:
-        """Write what is asked for: the acceptance limits of the logs, and a summary in Markdown."""
+        """Write the files that the user asked for: verdicts as JUnit XML, and a summary in Markdown."""
         if self.junit is not None:
             acceptance.write_junit(self.junit, suites(), command)
         if self.markdown is not None:
@@ -427,7 +428,7 @@ def report_options(*further: Option) -> Option:
 
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.Baseline | None:
-    """Find the reports of --baseline; refuse gates that cannot be read, or need one where there is none."""
+    """Return the reports of --baseline; refuse invalid gates, and gates that need a baseline where none is given."""
     relative = [gate for gate in gates if names_baseline(gate)]
     if place is not None:
         return dropout_directory.open_baseline(place)
@@ -438,7 +439,7 @@ def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.B
 
 
 def calibrations_of(files: Sequence[Path], request: ReportRequest) -> tuple[Calibration, ...]:
-    """Read the files of --calibration; refuse --refit-sensors where there is none."""
+    """Return the calibrations in the files of --calibration; refuse --refit-sensors without a calibration."""
     if request.refit_sensors and not files:
         raise click.UsageError("--refit-sensors refits the sensors of a calibration: name one with --calibration")
     return tuple(map(formats.open_calibration, files))
@@ -450,7 +451,7 @@ def names_baseline(gate: str) -> bool:
 
 
 def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
-    """Refuse a baseline that has none of the logs: a gate that is never checked would always pass."""
+    """Refuse a baseline without any of the logs, because a gate that is never checked would always pass."""
     relative = [bool(one.not_checked) for one in verdicts if one.relative]
     if relative and all(relative):
         advice = "logs are matched by content, else by name"
@@ -458,7 +459,7 @@ def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
 
 
 def options_to_repeat(settings: ConfigSources, request: FitRequest) -> list[str]:
-    """Return the options of this call that the next command needs too."""
+    """Return the options of this call that the proposed next command needs too."""
     pairs = [("--config", settings.file), ("--robot", settings.robot), *(("--set", one) for one in settings.sets)]
     pairs += [("--from", request.start), ("--to", request.end)]
     return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]

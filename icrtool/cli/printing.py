@@ -1,4 +1,4 @@
-"""What a command prints: results as text or JSON on standard output; stages, warnings and errors on standard error.
+"""Output of a command: results as text or JSON on standard output; stages, warnings and errors on standard error.
 
 Tables are laid out by rich on a terminal, and are plain text elsewhere.
 """
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 CLEAR = "\r\x1b[K"
 REFRESH_S = 0.1
-"""Shortest time between two updates of the share done on a terminal [s]."""
+"""Shortest time between two updates of the progress on a terminal [s]."""
 
 WIDEST = 120
-"""Largest number of columns of a terminal that are used."""
+"""Largest used width of a terminal [characters]."""
 
 FEWEST_COLUMNS = 3
-"""Smallest number of columns of a table that are shown, however narrow the terminal is."""
+"""Smallest number of columns of a table that a narrow terminal shows."""
 
 TEXT_STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
 
@@ -74,7 +74,7 @@ def _print_table(block: Table, console: Console) -> None:
     sides = table.sides()
     for number, side in enumerate(sides):
         head = RichText(str(table.head[number])) if table.head else ""
-        # A sentence, in the last column, is wrapped; a name or a number is not broken.
+        # The sentence in the last column is wrapped; names and numbers are not.
         last = number == len(sides) - 1
         shown.add_column(
             head, justify="left" if side == "l" else "right", no_wrap=not last or side == "r", header_style="bold",
@@ -89,7 +89,7 @@ def _print_table(block: Table, console: Console) -> None:
 
 
 def write_or_print(text: str, output: Path | None) -> None:
-    """Write a text to its file, or print it where none is named."""
+    """Write a text to a file, or print it if the user names no file."""
     if output is None:
         click.echo(text, nl=False)
     else:
@@ -108,7 +108,7 @@ def print_error(text: str) -> None:
 
 
 class Printer(NamedTuple):
-    """What a command prints, by its options -q, -v and --json."""
+    """Printer of a command, with its options -q, -v and --json."""
 
     quiet: bool = False
     verbose: bool = False
@@ -120,7 +120,7 @@ class Printer(NamedTuple):
         return not (self.quiet or self.as_json)
 
     def show(self, blocks: Iterable[Block]) -> None:
-        """Print a document as text, with -v all of it."""
+        """Print a document as text; with -v the whole document."""
         if self.shows:
             print_document(blocks, verbose=self.verbose)
 
@@ -135,7 +135,7 @@ class Printer(NamedTuple):
         Parameters
         ----------
         command : its name on the command line
-        document : a record, or plain data and numpy's; numbers that are not finite become null
+        document : a record, or plain data with arrays of numpy; infinity and NaN become null
         """
         if not self.as_json:
             return
@@ -157,7 +157,7 @@ class Printer(NamedTuple):
     def warn_of(self, run: Run, *, most: int | None = None) -> None:
         """Print the warnings of a run, with -v also why each stream was chosen.
 
-        `most`: print at most this number, the gravest first, and how many more there are; -v and --json print all.
+        At most `most` warnings are printed, the gravest first, then the number of the others; -v and --json print all.
         """
         # On a terminal the result names the gravest warning, so warnings are printed only with -v or --json.
         if self.verbose or self.as_json or most is None:
@@ -178,19 +178,19 @@ class Printer(NamedTuple):
 
     @contextmanager
     def progress(self, label: str) -> Iterator[Callable[[float], None]]:
-        """Yield a function that shows which share of the work of one stage is done."""
+        """Yield a function that shows the finished share of the work of one stage, 0 to 1."""
         with Stages(label, quiet=self.quiet) as stages:
             stages.begin("")
             yield stages.share
 
 
 class Inputs:
-    """The inputs of a command: one that cannot be used is reported at once and does not stop the others.
+    """The inputs of a command. An error of one input is reported at once, and the other inputs are still processed.
 
     Attributes
     ----------
-    documents : what --json prints of each, begun with its place and its status
-    errors : why an input could not be used, by its place
+    documents : output of --json for each input, which begins with its place and its status
+    errors : why an input could not be used, by the place of the input
     """
 
     def __init__(self, key: str) -> None:
@@ -200,7 +200,7 @@ class Inputs:
 
     @contextmanager
     def each(self, source: Path) -> Iterator[dict[str, Any]]:
-        """Do the work on one input; give its document."""
+        """Run the block on one input, report its errors, and yield the document of the input."""
         document: dict[str, Any] = {self._key: escaped(str(source)), "status": "done"}
         self.documents.append(document)
         try:
@@ -213,7 +213,7 @@ class Inputs:
             print_error(str(err) if named else f"{name}: {err}")
 
     def leave(self, what: str, *, gate_failed: bool = False) -> None:
-        """Exit with status 3 if an acceptance limit was not met, else 1 if an input, a `what`, could not be used."""
+        """Exit with status 3 if an acceptance limit was not met, else 1 if an input (a `what`) could not be used."""
         failed = [shortened(escaped(source), LONGEST_NAME) for source in self.errors]
         if failed and len(self.documents) > 1:
             print_error(f"{len(failed)} of {len(self.documents)} {what} could not be used: {listed(failed, 5)}")
@@ -222,7 +222,7 @@ class Inputs:
 
 
 class LiveLine:
-    """A line on a terminal about what is being done; the next output begins at the left end of this line."""
+    """A line on a terminal about the current work; the next output replaces it."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         self.on_terminal = not quiet and sys.stderr.isatty()
@@ -234,18 +234,18 @@ class LiveLine:
         self.rewrite("")
 
     def rewrite(self, text: str) -> None:
-        """Show another text in its place."""
+        """Replace the text of the line."""
         if self.on_terminal:
             sys.stderr.write(f"{CLEAR}{text}")
             sys.stderr.flush()
 
 
 class Stages(LiveLine):
-    """The stages of the work on one log; at the end they are erased from the terminal.
+    """Display of the stages of the work on one log, erased from the terminal at the end.
 
     Parameters
     ----------
-    name : of the log, printed before the stage
+    name : name of the log, printed before the stage
     quiet : print nothing
     verbose : where standard error is no terminal, print a line for each stage
     """
@@ -268,11 +268,11 @@ class Stages(LiveLine):
         super().__exit__(*raised)
 
     def _compiling(self) -> None:
-        """Show why the first command on a computer waits."""
+        """Show that kernels are being compiled, for which the first command on a computer waits."""
         self.rewrite(f"{self._title} (compiling, once on this computer: about 8 s) …")
 
     def begin(self, stage: str) -> None:
-        """Begin a stage: what is being done, for example ``reading``."""
+        """Begin a stage with this name, for example ``reading``."""
         self._title = f"{self.name}: {stage}" if stage else self.name
         self._shown_s = time.monotonic()
         self.rewrite(f"{self._title} …")
@@ -280,7 +280,7 @@ class Stages(LiveLine):
             click.echo(f"{self.name}: {stage}", err=True)
 
     def share(self, done: float) -> None:
-        """Show which share of the stage is done, 0 to 1; at 1 only the name of the stage is shown."""
+        """Show the finished share of the stage, 0 to 1; at 1 only the name of the stage is shown."""
         now_s = time.monotonic()
         if self.on_terminal and now_s - self._shown_s >= REFRESH_S:
             self._shown_s = now_s

@@ -1,4 +1,4 @@
-"""``icrtool report``, the answer on a log or the page of a result, and ``icrtool compare``, which compares groups."""
+"""``icrtool report``, which answers on a log or writes the page of a result, and ``icrtool compare`` for groups."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def _report_on_log(
     source: Path, place: Place, config: Config, report: requests.ReportRequest, files: requests.ResultFiles,
     other_results: dropout_report.OtherResults, printer: Printer,
 ) -> None:  # fmt: skip
-    """Print what a log shows, fitted unless its run is there, and write its run and report."""
+    """Print the report on a log, and write its run and report; an existing run is not fitted again."""
     request = report.configured(config)
     there = run_directory.holds_run_of(path_of(place), source, config, request.fit)
     if there:
@@ -117,12 +117,12 @@ def _report_on_log(
 
 
 def _write_page(source: Path, output: Path | None, *, coordinates: bool, answers: bool, printer: Printer) -> None:
-    """Write the page of a result, into its folder or as `output`; with `answers`, print the answers of a run, too."""
+    """Write the page of a result into its folder or to `output`; with `answers`, also print the answers of a run."""
     if isinstance(source, UrlPath):
         advice = "copy it to a place on disk, or write its page there: icrtool dropout-report ADDRESS"
         raise errors.RunError(source, "is a run at an address", advice)
     place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
-    # The usual folder of a page may hold files of a stranger.
+    # The folder of a result may hold files of a stranger.
     file, ours = (Below(place.parent, place.name), run_directory.is_page) if output is None else (place, None)
     atomic.check_place(file, ours)
     if run_directory.is_run_directory(source):
@@ -159,7 +159,7 @@ def _page_of(source: Path) -> str:
 
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> tuple[str, list[Block]]:
-    """Return the page of a run, and its answers; a report and pictures that are not there are made for the page."""
+    """Return the page of a run, and its answers; a missing report and missing pictures are made for the page."""
     run, report = run_directory.open_run(directory), pages.read_report(directory)
     pictures = pages.pictures_of_run(directory)
     if "trajectory" not in pictures:
@@ -172,7 +172,7 @@ def _page_of_run(directory: Path, *, coordinates: bool) -> tuple[str, list[Block
 
 @contextmanager
 def _as_written(place: Path, advice: str) -> Iterator[None]:
-    """Refuse a document that was edited, or that another version wrote."""
+    """Refuse a document that was edited or that another version wrote."""
     from jinja2 import TemplateError
 
     try:

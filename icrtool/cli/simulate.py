@@ -43,25 +43,25 @@ if TYPE_CHECKING:
     from icrtool.simulation.study_records import Study, StudyRequest
 
 GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
-"""Pentzer 2014, Sections 4 and 6.5."""
+"""Standard deviation of the position noise by kind of receiver [m] (Pentzer 2014, Sections 4 and 6.5)."""
 
 DEFAULT_ROBOT = "pentzer-tracked"
 DEFAULT_MULTIPLIER = 1.5
-"""The true ICRs where none are given: this many half track widths to either side, x 0."""
+"""Default of the true y ICRs, in half track widths; the default of x is 0."""
 
 ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
 PAPER_COUNTS = 8192.0
-"""Of a wheel revolution, where the robot states none."""
+"""Encoder counts of a wheel revolution for a robot without configured counts."""
 
 
 def change_text(text: str) -> tuple[float, tuple[float, ...]]:
-    """Read ``T:YR,YL,X``."""
+    """Return the change of the ICRs in a text ``T:YR,YL,X``."""
     time, _, icrs = text.partition(":")
     return numbers_reader("T:YR,YL,X", 1)(time)[0], numbers_reader("T:YR,YL,X", 3)(icrs)
 
 
 def span_text(text: str) -> tuple[float, ...]:
-    """Read ``BEGIN:END``."""
+    """Return begin and end [s] in a text ``BEGIN:END``."""
     span = numbers_reader("BEGIN:END", 2)(text.replace(":", ",", 1) if ":" in text else "")
     if span[1] <= span[0]:
         raise click.BadParameter(f"{text!r} ends before it begins")
@@ -69,7 +69,7 @@ def span_text(text: str) -> tuple[float, ...]:
 
 
 def gnss_text(text: str) -> float:
-    """Read ``rtk``, ``waas`` or metres."""
+    """Return the position noise [m] of ``rtk``, ``waas`` or a number of metres."""
     if text in GNSS_NOISE_M:
         return GNSS_NOISE_M[text]
     metres = numbers_reader("rtk, waas or METRES", 1)(text)[0]
@@ -79,7 +79,7 @@ def gnss_text(text: str) -> float:
 
 
 def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) -> None:
-    """Refuse a change of the ICRs that a drive is too short for."""
+    """Refuse a change of the ICRs after the end of a drive."""
     unreached = next((time for time, _ in changes if time >= duration_s), None)
     if unreached is not None:
         why = f"no change at {unreached:g} s: the drive lasts {duration_s:g} s"
@@ -87,7 +87,7 @@ def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) ->
 
 
 def angle_reader(within: click.FloatRange | None = None) -> Callable[[Any], float]:
-    """Return what reads an angle in degrees, of a range where one is given, and gives radians."""
+    """Return a function that converts a text in degrees to radians, and refuses angles outside a given range."""
 
     def radians(text: Any) -> float:  # noqa: ANN401 - what click has: a text, or the default
         return math.radians((within or click.FLOAT).convert(text, None, None))
@@ -119,7 +119,7 @@ DRIVE_DEFAULTS: dict[str, object] = {
     "kind": "curved", "speed_mps": 0.4, "radius_m": 1.5, "leg_m": 10.0, "input_noise_mps": 0.0, "input_bias_mps": 0.0,
     "gnss_std_m": "rtk", "gnss_rate_hz": 20.0,
 }  # fmt: skip
-"""Of `simulate`, by field; a study has its own."""
+"""Defaults of `simulate` by field; a study has other defaults."""
 
 DYNAMICS = (
     flag("--dynamics", "Contacts slide with friction, loads shift, the driver steers: the ICRs follow from forces."),
@@ -153,11 +153,11 @@ RECORDED = (
 
 
 def drive_options(*further: Option, **defaults: object) -> Option:
-    """Return what adds `DRIVE`, --change and further options, as what changes a path, a plan, and sensors.
+    """Return a decorator that adds `DRIVE`, --change and further options, as functions that change path, plan, sensors.
 
     Parameters
     ----------
-    defaults : of `DRIVE`, by field, none for the others
+    defaults : defaults of `DRIVE` by field; other fields have no default
     """
     text = "The ICRs become these after T seconds; repeatable."
     change = option("--change changes", "T:YR,YL,X", change_text, text, multiple=True)
@@ -241,7 +241,7 @@ def simulate_command(
 def friction_robot(
     contacts: Change[FrictionRobot], config: Config, *, dynamics: bool, tracks: bool
 ) -> FrictionRobot | None:
-    """Return the robot on sliding contacts of the configured track width; None without --dynamics."""
+    """Return the robot on sliding contacts with the configured track width; None without --dynamics."""
     if not dynamics:
         if tracks or contacts(friction.FrictionRobot()) != friction.FrictionRobot():
             raise click.UsageError("--tracks, --friction and --friction-std belong to --dynamics: give it too")
@@ -252,13 +252,13 @@ def friction_robot(
 
 
 def default_icrs(config: Config) -> Icrs:
-    """Return the true ICRs where none are given."""
+    """Return the default of the true ICRs, right, left, x [m]."""
     half = DEFAULT_MULTIPLIER * needed_number(config, "track_width_m") / 2
     return half, -half, 0.0
 
 
 def needed_number(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> float:
-    """Return a number of the robot that a simulation cannot do without."""
+    """Return a number of the robot that a simulation needs; refuse a robot without it."""
     value: float | None = getattr(config.robot, key)
     if value is None:
         advice = f"--set robot.{key}=…, or --robot NAME"
@@ -368,7 +368,7 @@ def study_command(
 
 
 def check_varied(study: Study, name: str, arguments: Mapping[str, object]) -> None:
-    """Refuse an option for what a study varies, and values where it varies no number.
+    """Refuse an option for a quantity that the study varies, and values for a study that varies no number.
 
     Parameters
     ----------
