@@ -1,1 +1,1 @@
-"""Bytes to tables and back: the only package that opens a log, and the only one that knows ENU."""
+"""Convert logs to tables and tables to logs. Only this package opens a log, and only this package converts ENU."""

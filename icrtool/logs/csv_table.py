@@ -1,4 +1,4 @@
-"""A CSV file as a data frame: in parts of bounded size, of which the columns that a log can use are kept."""
+"""Read a CSV file into a data frame, in parts of bounded size; only the columns that a log can use are kept."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LONGEST_HEAD_BYTES, MOST_COLUMNS = 1 << 18, 4096
-"""Largest size of the line that names the columns [bytes], and largest number of columns: pandas takes a minute for a
+"""Largest size of the line with the names of columns [bytes], and largest number of columns. pandas takes 1 min for a
 million columns."""
 
 CELLS_AT_ONCE = 1 << 20
-"""Number of cells that are read together: each takes up to 100 bytes."""
+"""Number of cells that are read at a time. A cell takes up to 100 bytes."""
 
 MOST_EMPTY, LEAST_CELLS = 4, 1_000_000
-"""Largest number of cells for each byte of a file, and the number that any file may have. pandas makes a cell for each
-column of each row, and rows of two bytes below thousands of names would fill the memory."""
+"""Largest number of cells for each byte of a file, and number of cells that every file may have. pandas makes a cell
+for each column of each row, so rows of two bytes under thousands of names would fill the memory."""
 
 _COUNTED_BYTES = 1 << 20
 
 MORE_VALUES = "its rows have more values than its first line has names"
-"""Why a table is refused: values of a row belong to no column."""
+"""Reason for refusing a table with values that belong to no column."""
 
 
 class TableForm(NamedTuple):
@@ -38,16 +38,16 @@ class TableForm(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What is reported of it; empty for commas between columns."""
+        """Description of the form for messages; empty for columns separated by commas."""
         signs = {";": "semicolons", "\t": "tabs"}
         comma = ", decimal comma" if self.decimal == "," else ""
         return f"{signs[self.separator]} between columns{comma}" if self.separator in signs else ""
 
 
 def table_form(head: bytes, row: bytes) -> TableForm:
-    """Return the form of a table by its first line and first row.
+    """Return the form of a table, by its first line and first row.
 
-    Where semicolons or tabs part the columns, as in countries with a decimal comma, a comma in the row is a decimal
+    If semicolons or tabs separate the columns, as in countries with a decimal comma, a comma in the row is the decimal
     sign.
     """
     counts = {sign: head.count(sign.encode()) for sign in (",", ";", "\t")}
@@ -58,15 +58,15 @@ def table_form(head: bytes, row: bytes) -> TableForm:
 def csv_frame(path: Path) -> pd.DataFrame:
     """Return the columns of a CSV file that a log can use; the first line names them.
 
-    Its `attrs` hold the form of the table, and the first names.
+    `attrs` of the data frame hold the form of the table, and its first names.
 
     Raises
     ------
     OSError
         The file cannot be read.
     ValueError
-        It is not a table: text that is not UTF-8, a line that names too many columns, or rows with more values or far
-        fewer.
+        The file is not a table: it is not UTF-8, names too many columns, or has rows with more values than columns or
+        far fewer.
     """
     import pandas as pd
 
@@ -84,7 +84,7 @@ def csv_frame(path: Path) -> pd.DataFrame:
         _check_cells(stream, form)
     parts, names = [], list[object]()
     with warnings.catch_warnings():
-        # It warns where rows have more values than the first line has names, and drops what is beyond.
+        # pandas warns of rows with more values than names, and drops the further values.
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             with pd.read_csv(

@@ -1,7 +1,7 @@
 """Read a log: open it, read the columns of all candidates in one pass, choose, convert to the frames of `icrtool`.
 
-A log may also be one CSV file (columns: `icrtool.RobotLog.from_frames`). What a log holds before anything is chosen is
-a record of its own, which `icrtool info` prints.
+A log may also be one CSV file (columns: `icrtool.RobotLog.from_frames`). `survey_document` returns the content of a log
+before topics are chosen; `icrtool info` prints it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from icrtool.records.text import LogText, escaped
 Progress = Callable[[float], None]
 
 Moment = float | str | datetime
-"""Seconds since the log's first message, or a time of day: a `datetime`, or a text in ISO 8601."""
+"""Type of a moment: seconds since the first message of the log, or date and time as `datetime` or ISO 8601 text."""
 
 _CSV_NAME = re.compile(rf"\.csv(?:{PACKED_SUFFIX})?$", re.IGNORECASE)
 
@@ -55,13 +55,13 @@ def survey_log(
     start: Moment | None = None,
     end: Moment | None = None,
 ) -> Survey:
-    """Read all candidate topics of a log.
+    """Return the content of all candidate topics of a log.
 
     Parameters
     ----------
-    path : a log as `open_log` knows them
+    path : a log, as for `open_log`
     progress : called with the share of the log that has been read, 0 to 1
-    start, end : as `read_log` takes them
+    start, end : as for `read_log`
 
     Raises
     ------
@@ -82,7 +82,7 @@ def survey_log(
             candidates = find_candidates(tables, config, unread)
             inputs.result()
         except BaseException:
-            # The pool waits for its threads states_before it passes on Ctrl-C or an error.
+            # The pool waits for its threads before Ctrl-C or an error reaches the caller.
             ended.set()
             raise
         channels, transfer = tuple(container.channels), container.transfer()
@@ -99,7 +99,7 @@ def read_log(
     start: Moment | None = None,
     end: Moment | None = None,
 ) -> RobotLog:
-    """Read wheels, position and heading of a log into tables.
+    """Return wheels, position and heading of a log as tables.
 
     Parameters
     ----------
@@ -114,13 +114,13 @@ def read_log(
     Raises
     ------
     LogError
-        The log cannot be read, or was written to meanwhile.
+        The log cannot be read, or was written to while it was read.
     MissingStreamError
-        No wheels or no position in it; a heading may be missing.
+        The log has no wheels or no position. A heading may be missing.
     ConfigError
-        A configured topic that is not there, or a width or radius that is needed.
+        A configured topic is not in the log, or a needed width or radius is not configured.
     DataError
-        Streams without usable samples.
+        A stream has no usable samples.
     """
     config = config if config is not None else Config()
     path = place_of(path)
@@ -132,7 +132,7 @@ def read_log(
 def _collect(
     container: Container, config: Config, progress: Progress | None, cut: Cut
 ) -> tuple[list[TopicTable], dict[str, str]]:
-    """Return the columns of all channels that some role may need, read in one pass over the log."""
+    """Return the columns of all channels that may have a role, read in one pass over the log."""
     wanted = fields_to_take(container.channels, config)
     static = frozenset(channel.id for channel in container.channels if is_static(channel))
     cut = cut._replace(whole=static) if cut != WHOLE else cut
@@ -155,7 +155,7 @@ def _collect(
 def collect_tables(
     container: Container, wanted: Mapping[int, tuple[str, ...]], cut: Cut = WHOLE, progress: Progress | None = None
 ) -> tuple[list[TopicTable], dict[str, str]]:
-    """Return the columns of some channels, read in one pass over the log, and by topic why others could not be read.
+    """Return the columns of some channels, read in one pass, and by topic why other channels could not be read.
 
     Parameters
     ----------
@@ -171,13 +171,13 @@ def collect_tables(
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
         for whole in blocks:
             block = cut.of(whole)
-            numbers = np.sort(block.channel)  # np.unique takes four times as long
+            numbers = np.sort(block.channel)  # np.unique takes four times as long as sorting
             for number in numbers[np.diff(numbers, prepend=-1) > 0].tolist():
                 if number not in wanted:
                     continue
                 try:
                     if number not in collectors:
-                        # A definition is compiled when its first message comes: a log may declare any number of topics.
+                        # A definition is compiled at its first message, because a log may declare any number of topics.
                         collectors[number] = None
                         earlier_table = by_topic.get(topics[number])
                         by_topic[topics[number]] = collector_for(by_id[number], wanted[number], earlier_table, budget)
@@ -209,7 +209,7 @@ def read_moment(moment: Moment | None, key: str) -> float | datetime | None:
     Raises
     ------
     LogError
-        Neither a finite number nor a time in ISO 8601.
+        The moment is neither a finite number nor a time in ISO 8601.
     """
     if isinstance(moment, str):
         text = moment
@@ -238,12 +238,12 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
     if start is None and end is None:
         return WHOLE
     first, span = 0, container.span_ns()
-    if span is not None and span[0] >= LATEST_NS:  # as the container counts such times
+    if span is not None and span[0] >= LATEST_NS:  # the container converts such times in the same manner
         span = counted_ns(span[0]), counted_ns(span[1])
     if isinstance(start, float) or isinstance(end, float):
         if span is not None:
             first = span[0]
-        else:  # without an index the first and last time are found by reading all messages
+        else:  # without an index, only reading all messages gives the first and the last time
             blocks = container.blocks(frozenset(channel.id for channel in container.channels))
             first = min((int(block.log_time_ns.min()) for block in blocks if len(block.log_time_ns)), default=0)
     begin_ns = max(log_time_of(start, first), 0) if start is not None else 0
@@ -272,7 +272,7 @@ def is_table(path: Path) -> bool:
 
 
 def read_table(path: Path, start: Moment | None = None, end: Moment | None = None) -> RobotLog:
-    """Read a CSV file, also compressed: a row for each stamp, with the columns that were measured then.
+    """Return the log in a CSV file, also compressed, with a row for each stamp and the columns measured at this stamp.
 
     Raises
     ------
@@ -310,14 +310,14 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
 
 
 TOPIC_GAP_IN_INTERVALS = 5.0
-"""Least length of a gap, in median intervals of the topic."""
+"""Shortest gap, in median intervals of the topic."""
 
 SHORTEST_GAP_S = 0.1
-"""Least length of a gap [s]."""
+"""Shortest gap [s]."""
 
 
 def long_intervals(interval_s: Floats) -> Bools:
-    """Return which intervals (n,) [s] between messages are gaps; a single interval is none."""
+    """Return whether each interval (n,) [s] between messages is a gap; a single interval is no gap."""
     if len(interval_s) < 2:
         return np.zeros(len(interval_s), np.bool_)
     return np.asarray(interval_s > max(TOPIC_GAP_IN_INTERVALS * float(np.median(interval_s)), SHORTEST_GAP_S))
@@ -328,11 +328,11 @@ class SurveyedTopic(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    messages : how many; None where nothing counts them
-    read : its messages were read, because it may have a role
-    rate_hz : 1 / median interval; None where it was not read
-    gaps : intervals far longer than the median, with the `longest_gap_s`
-    unreadable : messages that do not fit their type
+    messages : number of messages; None where it is not known
+    read : whether its messages were read, because the topic may have a role
+    rate_hz : 1 / median interval; None for a topic that was not read
+    gaps : number of intervals far longer than the median; `longest_gap_s` is the longest of them [s]
+    unreadable : number of messages that do not fit their type
     not_read_because : why a topic of a type with a role was not read
     """
 
@@ -348,7 +348,7 @@ class SurveyedTopic(Record, frozen=True, kw_only=True):
 
 
 class SurveyedSource(Record, frozen=True):
-    """A candidate of a role; `problem`: why it cannot be used; `stamps`: what is known of its clock."""
+    """A candidate for a role. `problem`: why it cannot be used; `stamps`: statement about its clock."""
 
     topic: str
     message_type: str
@@ -358,7 +358,7 @@ class SurveyedSource(Record, frozen=True):
 
 
 class SurveyDocument(Record, frozen=True):
-    """What `icrtool info` states of a log as it lies there; `transfer`: how much came over a connection."""
+    """Content of a log before topics are chosen, for `icrtool info`. `transfer`: amount of data over a connection."""
 
     inputs: tuple[InputFile, ...]
     transfer: str | None

@@ -1,4 +1,4 @@
-"""Read poses of topics that feed no role: what a localisation on the robot computed while the log was recorded."""
+"""Read poses of topics without a role, which a localisation on the robot computed during the recording."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from icrtool.records.text import did_you_mean, listed
 from icrtool.records.topic_poses import TopicPoses
 
 LEAST_QUATERNION = 0.1
-"""Least norm of a quaternion that is an orientation; it then counts as 1."""
+"""Smallest norm of a quaternion that is accepted as an orientation and normalised."""
 
 LARGEST_QUATERNION = 10.0
-"""Largest norm of a quaternion that is an orientation; it then counts as 1."""
+"""Largest norm of a quaternion that is accepted as an orientation and normalised."""
 
 
 def _pose_fields() -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield the types of metric poses, and of each the fields: x and y, then the quaternion x, y, z, w."""
+    """Yield each message type with metric poses, with its fields: x and y, then the quaternion x, y, z, w."""
     for name, fix in MESSAGE_TYPES["gnss"].items():
         turn = MESSAGE_TYPES["heading"].get(name)
         if isinstance(fix, Fix) and fix.metric and isinstance(turn, Orientation):
@@ -46,11 +46,11 @@ def _pose_fields() -> Iterator[tuple[str, tuple[str, ...]]]:
 
 
 POSE_FIELDS = dict(_pose_fields())
-"""By message type, the fields of position x, y and of the quaternion x, y, z, w."""
+"""Fields of the position x, y and of the quaternion x, y, z, w, by message type."""
 
 
 def scorable_topics(survey: SurveyDocument, used: Iterable[str]) -> tuple[str, ...]:
-    """Return the topics of a log that hold poses and are neither `used` as reference nor goals."""
+    """Return the topics of a log with poses that are neither goals nor `used` as reference."""
     taken = set(used)
     return tuple(
         one.topic
@@ -67,8 +67,9 @@ def read_topic_poses(path: str | Path, topics: Sequence[str], progress: Progress
 
     Parameters
     ----------
-    path : as `icrtool.read_log` takes it
-    topics : names; of ``tf2_msgs/TFMessage`` the poses of the robot's base in the root of the moving transforms
+    path : a log, as for `icrtool.read_log`
+    topics : names of topics. A topic of type ``tf2_msgs/TFMessage`` gives the poses of the robot's base in the root
+        frame of the moving transforms
     progress : called with the share of the log that has been read
 
     Raises
@@ -124,7 +125,7 @@ def _channels_of(topics: Sequence[str], channels: Sequence[Channel]) -> list[Cha
 
 
 def _fields_of(channel: Channel) -> tuple[str, ...]:
-    """Return the fields that poses of a channel are read from; empty where it holds none."""
+    """Return the fields with the poses of a channel; empty for a channel without poses."""
     if channel.message_type in TRANSFORM_TYPES:
         return () if is_static(channel) else (*HEADER, *TRANSFORM_FIELDS, *TRANSFORM_STAMP)
     fields = POSE_FIELDS.get(channel.message_type)
@@ -132,7 +133,7 @@ def _fields_of(channel: Channel) -> tuple[str, ...]:
 
 
 def _poses_of(table: TopicTable, log: Path) -> TopicPoses:
-    """Return the poses that a topic's messages hold."""
+    """Return the poses in the messages of a topic."""
     kind = str(table.message_type)
     if table.message_type in TRANSFORM_TYPES:
         table = every_transform_pose(table)
@@ -146,7 +147,7 @@ def _poses_of(table: TopicTable, log: Path) -> TopicPoses:
     if len(order[rows]) < 2:
         raise DataError(log, f"{table.topic} holds {len(order[rows])} usable poses", "at least two are needed")
     ahead, left, _ = turned_axis(0, *(one[rows] / norm[rows] for one in q))
-    # Seen from above, y is left of x; in a frame whose z points down it is right of x.
+    # Seen from above, y is left of x; in a frame with z down, y is right of x.
     side = 1.0 if frame_convention(table)[0] == "ned" else -1.0
     heading = unwrapped(np.arctan2(side * left, ahead))
     header_ns = None if stamps.header_ns is None else stamps.header_ns[rows]

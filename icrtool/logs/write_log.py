@@ -1,6 +1,6 @@
 """Write a robot log from columns: the options, the messages of each topic, and the file that holds them.
 
-Used by `icrtool simulate`, the exports, the sample logs and the tests.
+`icrtool simulate`, the exports, the sample logs and the tests use this module.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ COMPRESSIONS: dict[ContainerKind, tuple[Compression, ...]] = {
     "bag": ("none", "bz2", "lz4"),
     "db3": ("none", "zstd", "zstd-file"),
 }
-"""Compressions of each container. For db3, ``zstd`` compresses message by message, ``zstd-file`` the closed file."""
+"""Compressions of each container. For db3, ``zstd`` compresses each message, and ``zstd-file`` the closed file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WriteOptions:
-    """How a log is recorded: container, message types and conventions.
+    """Format of a written log: container, message types and conventions.
 
     Attributes
     ----------
@@ -51,10 +51,10 @@ class WriteOptions:
     heading : convention of the Imu. ``enu``: REP-103. ``ned``: yaw is the compass heading, body z down, and the frame
         is ``imu_link_ned`` (REP-145)
     compression : one of `COMPRESSIONS` of the container
-    wheel_radius_m : converts metres to radians and counts
-    track_width_m : b, by which a wheel controller divides for its angular velocity [m]
+    wheel_radius_m : wheel radius, for conversion of metres to radians and counts [m]
+    track_width_m : track width b, for the angular velocity of a wheel controller [m]
     counts_per_rev : encoder counts of one wheel revolution
-    heading_std_deg : written as the orientation's covariance
+    heading_std_deg : standard deviation of the heading, written as covariance of the orientation
     """
 
     container: ContainerKind = "mcap"
@@ -77,14 +77,15 @@ class WriteOptions:
 
 
 HEIGHT_STD_RATIO = 2.0
-"""Vertical over horizontal GNSS noise, a rule of thumb of GNSS geometry."""
+"""Ratio of vertical to horizontal GNSS noise, a usual value for the geometry of the satellites."""
 
 JACKAL_TYPES = ("jackal_msgs/msg/DriveFeedback", "jackal_msgs/msg/Feedback")
 ROS1_JACKAL_FEEDBACK = (
     "std_msgs/Header header\njackal_msgs/DriveFeedback[2] drivers\nfloat32 pcb_temperature\n"
     "float32 mcu_temperature\nint8 commanded_mode\nint8 actual_mode\n"
 )
-"""The ROS 1 form has two temperatures that the ROS 2 form, which is bundled, does not have (docs.ros.org/en/api)."""
+"""Definition of jackal_msgs/Feedback in ROS 1. It has two temperatures that the bundled definition of ROS 2 does not
+have (docs.ros.org/en/api)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,7 @@ class TopicMessages:
     Attributes
     ----------
     stamp_ns : int64 (n,)
-    payload : uint8 (n, size), one message a row; or the messages, where their sizes differ
+    payload : uint8 (n, size), a message in each row; or a list of messages if their sizes differ
     """
 
     topic: str
@@ -131,7 +132,7 @@ def load_typestore(*, ros1: bool) -> Typestore:
 
 
 def topic_plans(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
-    """Return the topics of a log, in the order wheels, position, heading: messages of one stamp are written so."""
+    """Return the topics of a log in the order of messages with equal stamps: wheels, position, heading."""
     known, enu = np.isfinite(columns.gnss_std_m), options.heading == "enu"
     variance = np.where(known, columns.gnss_std_m, 0.0) ** 2
     place = header_stamps(columns.gnss_stamp_ns) | {
@@ -168,7 +169,7 @@ def _wheel_plans(columns: SensorColumns, options: WriteOptions) -> Iterator[Topi
     stamps, radius = columns.wheel_stamp_ns, options.wheel_radius_m
     travel = {"left": columns.wheel_position_left_m, "right": columns.wheel_position_right_m}
     speed = {"left": columns.wheel_v_left_mps, "right": columns.wheel_v_right_mps}
-    # As wheel controllers report it: no slip, body x forward and y left (REP-103).
+    # The twist of a wheel controller: no slip, body x forward and y left (REP-103).
     forward, turn = (speed["right"] + speed["left"]) / 2, (speed["right"] - speed["left"]) / options.track_width_m
     changing, fixed = header_stamps(stamps), dict[str, object]()
     match options.wheels:
@@ -215,9 +216,9 @@ def serialise_topic(plan: TopicPlan, store: Typestore, *, ros1: bool = False) ->
 
     Parameters
     ----------
-    plan : its values
-    store : holds the definition of its message type
-    ros1 : serialise as ROS 1 does, else as CDR
+    plan : values of the messages
+    store : message types, with the definition of the type of the topic
+    ros1 : serialise in the format of ROS 1; False: CDR
     """
     message = blank_message(store, plan.message_type)
     for path, value in plan.fixed.items():
@@ -230,7 +231,7 @@ def serialise_topic(plan: TopicPlan, store: Typestore, *, ros1: bool = False) ->
     blank = encode()
     payload = np.tile(blank, (len(plan.stamp_ns), 1))
     for path, values in plan.columns.items():
-        # The bytes that change with a number are the bytes of the number.
+        # The bytes of a message that change with a number are the bytes of this number.
         _put(message, path, np.frombuffer(b"\x11" * values.itemsize, values.dtype)[0])
         changed = np.flatnonzero(encode() != blank)
         _put(message, path, values.dtype.type(0))
@@ -284,8 +285,8 @@ def write_mcap(
 
     Parameters
     ----------
-    metadata : becomes its metadata record ``icrtool``
-    library : name in its header
+    metadata : content of the metadata record ``icrtool``
+    library : name of the library in the header
     """
     from mcap.writer import CompressionType, Writer
 
@@ -326,7 +327,7 @@ def write_rosbag(path: Path, topics: Sequence[TopicMessages], store: Typestore, 
 
 
 def _in_time_order(topics: Sequence[TopicMessages]) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (index of the topic, stamp, message); at equal stamps in the order of the topics."""
+    """Yield (index of the topic, stamp, message) by stamp; messages of equal stamps in the order of the topics."""
     if not topics:
         return
     stamps = np.concatenate([topic.stamp_ns for topic in topics])
@@ -354,8 +355,8 @@ def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -
     Raises
     ------
     OutputError
-        `path` exists or cannot be written. No incomplete file stays: the log is written next to it under another name,
-        and renamed when it is complete.
+        `path` exists or cannot be written. No incomplete file stays, because the log is written under another name in
+        the same folder, and renamed when it is complete.
 
     Notes
     -----

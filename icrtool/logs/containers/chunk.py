@@ -1,8 +1,8 @@
-"""A chunk of an MCAP file or a ROS 1 bag: where it is, what it decompresses to, and where its records begin.
+"""A chunk of an MCAP file or a ROS 1 bag: its place, its decompressed content, and the begins of its records.
 
-Its stated size is checked before memory is allocated. The index of messages is only a hint. Each record must begin
-where the record before it ends, which is checked for all records at once. Records that the index lacks are found by
-following their lengths; where the index is wrong, all records are.
+The stated size of a chunk is checked before memory is allocated. The index of messages is only a hint: each record must
+begin at the end of the record before it, which is checked for all records at once. Records that the index lacks are
+found by their lengths; if the index is wrong, all records are found by their lengths.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 from icrtool.kernels.arrays import Bytes, Ints
 
 LARGEST_CHUNK_BYTES = 1 << 27
-"""Largest decompressed chunk [bytes], an eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; four are
-in memory at a time."""
+"""Largest decompressed chunk [bytes], 128 MiB. Recorders write chunks of 0.75 to about 10 MiB; four chunks are in
+memory at a time."""
 
 FREE_BYTES = LARGEST_CHUNK_BYTES
 """Largest size of a decompressed log of any ratio [bytes]."""
 
 LARGEST_RATIO = 100
-"""Largest size of a decompressed log over its size; `FREE_BYTES` more are allowed.
+"""Largest ratio of the decompressed size of a log to its size; `FREE_BYTES` more are allowed.
 
-Recorded chunks shrink by a factor of 2 to 20, images of one colour by more.
+Compression makes recorded chunks 2 to 20 times smaller; the factor is larger for images of one colour.
 """
 
 STORED = ("", "none")
@@ -38,8 +38,8 @@ STORED = ("", "none")
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 PIECE_BYTES = 1 << 24
-"""Bytes that are decompressed at once, while libraries hold twice that size; also the largest message that states no
-size."""
+"""Number of bytes that are decompressed at a time; libraries hold twice this number. Also the largest size of a message
+without a stated size [bytes]."""
 
 MOST_RECORDS = 1 << 18
 """Number of records that are followed at a time."""
@@ -54,12 +54,12 @@ class DecompressionError(Exception):
 
 
 class Space:
-    """Memory that is used again: fresh memory of the system takes the time of reading a file into it."""
+    """Memory that is used again, because new memory of the system takes as long as reading a file into it."""
 
     _bytes: Bytes = np.empty(0, np.uint8)
 
     def of(self, size: int) -> Bytes:
-        """Return `size` bytes (size,), the same memory as before where it is large enough."""
+        """Return memory (size,) of `size` bytes; the memory of the last call if it is large enough."""
         if len(self._bytes) < size:
             self._bytes = np.empty(size, np.uint8)
         return self._bytes[:size]
@@ -70,13 +70,14 @@ class Chunk(NamedTuple):
 
     Attributes
     ----------
-    at, length : where its content is in the file; before a bag's record is read: where that begins, and 0
-    channels : the channels that it holds, None without an entry
-    begin_ns, end_ns : first and last log time in it, 0 where they are not known
-    index_length : length of the message index records that follow it, and of the unread part of a bag's record
-    size : of its records, decompressed; -1 where there is no chunk in its place
-    compression : as the log calls it
-    is_cut : the file ends in it: what can be decompressed is not checked
+    at, length : place and length of the content in the file [bytes]; before the record of a bag is read: place of the
+        record, and 0
+    channels : channels in the chunk, None without an entry in the index
+    begin_ns, end_ns : first and last log time in the chunk, 0 where they are not known
+    index_length : length of the following message index records and of the unread part of a bag's record [bytes]
+    size : decompressed size of the records [bytes]; -1 if there is no chunk at this place
+    compression : name of the compression in the log
+    is_cut : the file ends inside the chunk; the checksum of the decompressed part is not checked
     """
 
     at: int
@@ -90,12 +91,12 @@ class Chunk(NamedTuple):
     is_cut: bool = False
 
     def is_partly(self, wanted: frozenset[int]) -> bool:
-        """Return whether it holds other channels, too."""
+        """Return whether the chunk holds other channels, too."""
         return self.channels is not None and not self.channels <= wanted
 
     @property
     def is_stored(self) -> bool:
-        """Whether its records can be read one by one."""
+        """Whether the records are not compressed, and can be read one by one."""
         return self.compression in STORED and self.index_length > 0 and self.size <= self.length
 
 
@@ -105,9 +106,9 @@ class Packed(NamedTuple):
     Attributes
     ----------
     compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
-    size : size when decompressed, as the log states; of uncompressed data, its own size [bytes]
-    partial : the data is cut off, or `size` is only a part of it: what can be decompressed is wanted
-    checksum : CRC-32 of the decompressed bytes, 0 where that is not checked
+    size : decompressed size as the log states; for uncompressed data its size [bytes]
+    partial : the data is cut off, or only a part of `size` bytes is wanted; the result may be shorter than `size`
+    checksum : CRC-32 of the decompressed bytes, 0 for no check
     """
 
     data: Bytes
@@ -118,15 +119,15 @@ class Packed(NamedTuple):
 
 
 def decompress(packed: Packed, space: Bytes) -> Bytes:
-    """Decompress a chunk.
+    """Return the decompressed bytes of a chunk.
 
     Parameters
     ----------
-    space : memory for the decompressed bytes, and one byte more
+    space : memory for the decompressed bytes and one further byte
 
     Returns
     -------
-    uint8, not to be written to; in `space`, in the chunk's data, or in memory of its own.
+    uint8, read-only: a part of `space`, of the data of the chunk, or new memory.
 
     Raises
     ------
@@ -139,7 +140,7 @@ def decompress(packed: Packed, space: Bytes) -> Bytes:
             case "" | "none":
                 out = data
             case "zstd":
-                # Where the space holds all of a frame, zstd decompresses straight into it.
+                # If the space holds a whole frame, zstd decompresses into it without a copy.
                 space = space[: size if partial else size + 1]
                 with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data.data) as reader:
                     out = space[: reader.readinto(space)]
@@ -159,7 +160,7 @@ def decompress(packed: Packed, space: Bytes) -> Bytes:
 
 
 def _in_pieces(decoder: Any, data: Bytes, size: int) -> Bytes:  # noqa: ANN401 - of two libraries
-    """Decompress up to `size` bytes and one more, a piece at a time."""
+    """Return up to `size` decompressed bytes and one further byte, decompressed piece by piece."""
     piece = decoder.decompress(data, max_length=min(size + 1, PIECE_BYTES))
     if len(piece) < PIECE_BYTES:
         return np.frombuffer(piece, np.uint8)
@@ -171,22 +172,22 @@ def _in_pieces(decoder: Any, data: Bytes, size: int) -> Bytes:  # noqa: ANN401 -
 
 @dataclass(slots=True)
 class Inflation:
-    """Limits the decompressed size of the chunks of a log to a multiple of their size in the file.
+    """Limit on the decompressed size of the chunks of a log, as a multiple of their size in the file.
 
     Attributes
     ----------
-    left : bytes that the next chunks may take in addition
+    left : bytes that the next chunks may have in addition
     """
 
     left: int = FREE_BYTES
 
     def count(self, packed: int, unpacked: int) -> None:
-        """Count what is decompressed [bytes].
+        """Count decompressed bytes.
 
         Raises
         ------
         DecompressionError
-            It is larger than the limit of a chunk or of the log.
+            Their number is larger than the limit of a chunk or of the log.
         """
         if unpacked > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {unpacked} bytes")
@@ -220,12 +221,12 @@ def record_starts(
     behind: Callable[[memoryview, int, int], int],
     ends: Callable[[Bytes, Ints], Ints],
 ) -> tuple[Ints, int]:
-    """Return where records begin (n,), and the first byte behind them.
+    """Return the begins of records (n,), and the first byte after the last record.
 
     Parameters
     ----------
-    behind : returns where the record at a place ends, if that is before an end; the place itself where there is none
-    ends : returns where messages (n,) end; their begin where there is none
+    behind : returns the end of the record at a place if it is before an end; the place itself if it has no record
+    ends : returns the ends of messages (n,); the begin of a message where there is no message
     """
     view = data.data
     if hint is not None and 0 < len(hint) <= MOST_RECORDS and hint[0] >= begin:
@@ -246,7 +247,7 @@ def record_starts(
 def follow_records(
     data: memoryview, at: int, end: int, behind: Callable[[memoryview, int, int], int]
 ) -> tuple[list[int], int]:
-    """Return where the records [at, end) begin, one after the other, and where they stop."""
+    """Return the begins of the records in [at, end), found one after the other, and the place where they stop."""
     starts: list[int] = []
     while len(starts) < MOST_RECORDS and (after := behind(data, at, end)) > at:
         starts.append(at)

@@ -1,7 +1,7 @@
-"""Connections to the places of addresses: the one place that opens them, by fsspec, with a limit of time.
+"""Connections to servers: the only module that opens them, with fsspec and with limits of time.
 
-Only an address that the user, or his manifest, names is connected to, and where its server redirects to in public.
-Credentials are found by the provider's own library.
+Connections are made only to addresses that the user or a manifest of the user names, and to public addresses that their
+servers redirect to. The library of the provider finds the credentials.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from icrtool.records.text import LONGEST_NAME, LONGEST_TEXT, shortened
 Result = TypeVar("Result")
 
 SLOWEST_BPS = 10_000
-"""Slowest rate at which a server may send what it was asked for, after `server_timeout_s` [bytes/s]. A server that
-sends a byte now and then would else keep a command for days."""
+"""Slowest rate at which a server may send data after `server_timeout_s` [bytes/s]. Without this limit a server that
+sends a byte now and then would stop a command for days."""
 
 LARGEST_LISTING_BYTES = 1 << 22
-"""Largest page that a web server may send as the list of a folder [bytes]: some 40,000 names."""
+"""Largest size of a web page with the list of a folder [bytes]. It has space for about 40,000 names."""
 
 _NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
           "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
-"""The library that each kind of address is read with."""
+"""Name of the library for each kind of address."""
 
 _LOGGERS = ("fsspec", "s3fs", "aiobotocore", "botocore", "gcsfs", "google", "adlfs", "azure", "aiohttp", "asyncio")
 
@@ -42,7 +42,7 @@ _FAILURES = (
     ("google.auth.exceptions", "GoogleAuthError"), ("gcsfs.retry", "HttpError"),
     ("azure.core.exceptions", "AzureError"), ("fsspec.exceptions", "FSTimeoutError"),
 )  # fmt: skip
-"""Errors that libraries raise in addition to OSError, where they are loaded."""
+"""Module and name of the errors that libraries raise in addition to OSError."""
 
 _READ_BYTES = 1 << 16
 """Number of bytes of a page that are read at a time."""
@@ -62,11 +62,11 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
     except ImportError as err:
         raise LogError(path, f"needs {needed or err}", f"pip install 'icrtool[{extra}]'") from err
     for name in _LOGGERS:
-        # They log tracebacks of requests, and addresses with their queries; one line reports where they fail.
+        # These libraries log tracebacks and addresses with their queries. icrtool reports a failure in one line.
         if (logger := logging.getLogger(name)).level == logging.NOTSET:
             logger.setLevel(logging.CRITICAL + 1)
     try:
-        # `url_to_fs` of fsspec would follow chains with ::, also behind a question mark
+        # `url_to_fs` of fsspec is not used, because it follows chains with ::, even after a question mark.
         address = path.scheme + path.url[len(path.scheme) :]
         settings = ask_server(path, lambda: {**kind._get_kwargs_from_urls(address), **_patience(path.scheme)})  # noqa: SLF001 - as it does
         found: tuple[Any, str] = ask_server(path, lambda: (kind(**settings), kind._strip_protocol(address)))  # noqa: SLF001
@@ -76,7 +76,7 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
 
 
 def _patience(scheme: str) -> dict[str, Any]:
-    """Return the settings of a file system with which requests to a silent server end."""
+    """Return the settings of a file system that end requests to a silent server."""
     quiet_s = server_timeout_s()
     if scheme.startswith("http"):
         from aiohttp import ClientTimeout
@@ -92,9 +92,10 @@ def _patience(scheme: str) -> dict[str, Any]:
 
 @cache
 def _short_pages() -> type[Any]:
-    """Return the class of answers of web servers that begin in time, and are not read beyond a length.
+    """Return a class of answers of web servers with limits on time and length.
 
-    The header has `server_timeout_s`, of whatever it consists; a body that is read whole has `LARGEST_LISTING_BYTES`.
+    The whole header must arrive within `server_timeout_s`; a body that is read whole has at most
+    `LARGEST_LISTING_BYTES`.
     """
     import asyncio
 
@@ -138,7 +139,7 @@ def _redirects() -> Any:  # noqa: ANN401 - of a library
 async def check_redirect(url: Any, target: Any) -> None:  # noqa: ANN401 - addresses of a library
     """Refuse a redirect from https to another scheme, or to another host that has no public address.
 
-    A server could else have a command read from a machine that only this one reaches.
+    Otherwise a server could make a command read from a machine that only this machine can reach.
     """
     import asyncio
     from ipaddress import ip_address
@@ -153,11 +154,11 @@ async def check_redirect(url: Any, target: Any) -> None:  # noqa: ANN401 - addre
 
 
 def in_time(files: Any, method: str, *given: object, expected_bytes: int = 0, **named: object) -> Any:  # noqa: ANN401 - of a library
-    """Return what a method of a file system returns; `TimeoutError` where its server sends too slowly.
+    """Return the result of a method of a file system; raise `TimeoutError` if the server sends too slowly.
 
     Parameters
     ----------
-    expected_bytes : that the answer has
+    expected_bytes : expected size of the answer [bytes]
     """
     if not getattr(files, "async_impl", False):
         return getattr(files, method)(*given, **named)
@@ -174,23 +175,23 @@ def check_pace(began_s: float, received: int, quiet_s: float) -> None:
 
 
 def ask_server(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done: str = "read") -> Result:
-    """Return the answer to a request, made again where the connection broke.
+    """Return the answer to a request, which is repeated after a broken connection.
 
     Parameters
     ----------
-    done : what is to be done: ``read`` or ``written``
+    done : purpose of the request for messages: ``read`` or ``written``
 
     Raises
     ------
     LogError
-        The file is not there, it must not be done, or the connection stays broken.
+        The file does not exist, access is refused, or the connection stays broken.
     """
     pauses = list(PAUSES_S) if again and path.scheme.startswith("http") else []
     while True:
         try:
             return ask()
         except _failures() as err:
-            # fsspec calls every failure of a web server a file that is not there, and names the true one as its cause.
+            # fsspec raises FileNotFoundError for every failure of a web server; its cause is the true error.
             cause = err.__cause__ if isinstance(err, FileNotFoundError) and err.__cause__ is not None else err
             status = getattr(cause, "status", None)
             if isinstance(cause, FileNotFoundError) or status == 404:
@@ -204,7 +205,7 @@ def ask_server(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, 
 
 
 def _words_of(cause: BaseException, path: UrlPath) -> str:
-    """Return what an error of a library states, without the secrets of the address."""
+    """Return the text of an error of a library, without the secrets of the address."""
     if isinstance(cause, TimeoutError):
         quiet, rate = f"{server_timeout_s():g} s", f"{SLOWEST_BPS / 1e3:g} kB/s"
         return f"its server sent nothing for {quiet}, or less than {rate} after them; --server-timeout sets the time"
@@ -213,7 +214,7 @@ def _words_of(cause: BaseException, path: UrlPath) -> str:
         message = " ".join(str(getattr(cause, "message", "")).split())
         if not status:
             return "its server redirects without an end"
-        # the rest of such a text is the address, or another address to which the server redirected
+        # The rest of such a text is the address, or an address that the server redirected to.
         words = "gave no answer of HTTP:" if cause.__cause__ is not None else f"answered {status}"
         return shortened(f"its server {words} {message}".strip(), LONGEST_TEXT)
     words = " ".join(path.without_own_secrets(str(cause)).split())

@@ -1,4 +1,4 @@
-"""What every container is: an open log with its channels, which yields blocks of raw messages."""
+"""The base class of containers: an open log with its channels, which yields blocks of raw messages."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ Result = TypeVar("Result")
 MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
 
 Report = Callable[[str, str], None]
-"""Takes the code and the text of a problem."""
+"""Function that is called with the code and the text of a problem."""
 
 LATEST_NS = 1 << 62
-"""Latest log time [ns], in the year 2116. A later time is damage, and differences of such times do not fit into 64
-bits."""
+"""Latest log time [ns], in the year 2116. A later time shows that the log is damaged, and differences of such times do
+not fit into 64 bits."""
 
 
 Times = TypeVar("Times", int, Ints)
 
 
 def counted_ns(time_ns: Times) -> Times:
-    """Return log times beyond `LATEST_NS` as possible times of the same order and intervals.
+    """Return times before `LATEST_NS` in place of log times after it, with the same order and intervals.
 
-    Times around 2^63 and 2^64, which damaged clocks give, stay together.
+    Damaged clocks give times around 2^63 and 2^64; such times of a log stay together.
     """
     return (time_ns + LATEST_NS // 2) & (LATEST_NS - 1)
 
@@ -54,10 +54,10 @@ class Channel:
     ----------
     id : the number that blocks refer to
     message_type : ``package/Name``, without ROS 2's ``/msg/``
-    encoding : ``cdr`` (ROS 2), ``ros1``, ``protobuf``, ``json``, or what the log calls one that cannot be read
-    definition : text of the message definition, empty when the log does not carry it; of Protobuf a character for each
-        byte of its FileDescriptorSet
-    definition_format : how a definition of ROS is written
+    encoding : ``cdr`` (ROS 2), ``ros1``, ``protobuf``, ``json``, or the name in the log of an unreadable encoding
+    definition : text of the message definition, empty if the log has none; for Protobuf a character for each byte of
+        the FileDescriptorSet
+    definition_format : format of a definition of ROS
     count : number of messages by the log's index, None without an index
     """
 
@@ -96,7 +96,7 @@ class MessageBlock(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """The part of a log that is read: log times in [begin_ns, end_ns); the channels in `whole` are read in full."""
+    """The part of a log that is read: log times in [begin_ns, end_ns), and all messages of the channels in `whole`."""
 
     begin_ns: int = 0
     end_ns: int = LATEST_NS
@@ -107,8 +107,8 @@ class Cut(NamedTuple):
 
         Parameters
         ----------
-        held : its channels, None without an index
-        begin_ns, end_ns : its first and last log time by the index; 0 and 0 where that is not known
+        held : channels in the chunk, None without an index
+        begin_ns, end_ns : first and last log time in the chunk by the index; 0 and 0 where they are not known
         """
         if held is not None and not held & wanted:
             return False
@@ -131,12 +131,12 @@ def work_ahead(
     work: Callable[[Item], Result], items: Iterable[Item], threads: int, count: int,
     weight: Callable[[Item], float] = lambda _: 0.0,
 ) -> Generator[tuple[Item, Callable[[], Result]]]:  # fmt: skip
-    """Yield items, each with a function that returns the result of work on it; threads work on the next items.
+    """Yield items, each with a function that returns the result of the work on it; threads work on the next items.
 
     Parameters
     ----------
-    count : number of items that are worked on before they are used
-    weight : the share of an item in the work that may be done ahead
+    count : largest number of items that threads work on ahead of their use
+    weight : returns the share of an item in the work that may be done ahead
     """
     pending: deque[tuple[Item, Future[Result]]] = deque()
     with ThreadPoolExecutor(threads) as pool:
@@ -155,11 +155,11 @@ def work_ahead(
 
 
 def made_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None = None) -> Generator[MessageBlock]:
-    """Yield blocks; the next one is made in a thread while one is used.
+    """Yield blocks; a thread makes the next block while a block is used.
 
     Parameters
     ----------
-    stop : called where no more blocks are wanted, to end the making of the next one
+    stop : called when no more blocks are wanted, so that the thread ends
     """
     with ThreadPoolExecutor(1) as pool:
         try:
@@ -168,7 +168,7 @@ def made_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None
                 pending = pool.submit(next, blocks, None)
                 yield block
         except BaseException:
-            # before the pool ends, which waits for the next block
+            # called before the end of the pool, which waits for the next block
             if stop is not None:
                 stop()
             raise
@@ -177,7 +177,7 @@ def made_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None
 def unpack_messages(
     blocks: Iterator[MessageBlock], wanted: frozenset[int], compression: str, report: Report
 ) -> Iterator[MessageBlock]:
-    """Decompress the wanted messages of a bag that was written with message compression.
+    """Yield blocks with the wanted messages decompressed, of a bag that was written with message compression.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def unpack_messages(
         held = 0
         is_wanted = np.isin(block.channel, list(wanted))
         if not is_wanted.any():
-            # With each block the reader asks how much of the log is read.
+            # The reader updates its progress with each block.
             yield block.rows(is_wanted)
         rows = np.flatnonzero(is_wanted)
         for row in rows.tolist():
@@ -232,13 +232,13 @@ def ros_type_name(name: str) -> LogText:
 
 
 class Origin(NamedTuple):
-    """How a log came to the disk, or how it is read at an address.
+    """Origin of a log that was fetched, unpacked, or is read at an address.
 
     Attributes
     ----------
-    inputs : the files that were read for it; empty: the log's own files
-    transfer : returns in words how it came over a connection; empty for nothing
-    remove : removes what was made for it
+    inputs : files that were read for the log; empty: the files of the log
+    transfer : returns a text about the transfer over a connection; empty without a transfer
+    remove : removes the temporary files of the log
     """
 
     inputs: tuple[InputFile, ...] = ()
@@ -251,12 +251,12 @@ class Container(ABC):
 
     Attributes
     ----------
-    path : as errors name it
-    files : the files that it consists of
+    path : path of the log in errors
+    files : files of the log
     channels : the topics, known before any block is read
-    mixed : more of a distant file was read than was wanted
+    mixed : a distant file was read in pieces that also hold other messages than the wanted ones
     message_compression : compression of each single message; empty for none
-    origin : how it came here, if it was fetched or unpacked
+    origin : origin of a log that was fetched or unpacked
     """
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
@@ -269,11 +269,11 @@ class Container(ABC):
 
     @property
     def problems(self) -> list[Note]:
-        """What could not be read and was left out; complete after the last block."""
+        """Findings about data that could not be read and were left out; complete after the last block."""
         return [*self._problems]
 
     def report(self, code: str, problem: str) -> None:
-        """Remember what could not be read: each finding once, and at most `MOST_PROBLEMS` of them."""
+        """Add a finding about unreadable data; each finding is kept once, and at most `MOST_PROBLEMS` are kept."""
         finding = note(code, shortened(escaped(problem), LONGEST_PROBLEM), self._name)
         if finding not in self._problems and len(self._problems) <= MOST_PROBLEMS:
             is_last = len(self._problems) == MOST_PROBLEMS
@@ -286,14 +286,14 @@ class Container(ABC):
         )
 
     def transfer(self) -> str:
-        """Return in words how much came over a connection, and why all of it; empty for nothing."""
+        """Return the amount of data over a connection as text, and why all was read; empty without a transfer."""
         why = "topics share compressed chunks, which are read whole" if self.mixed else ""
         return "; ".join(filter(None, [self.origin.transfer(), why]))
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[MessageBlock]:
         """Yield the messages of the channels in `wanted` in file order; other messages may be among them.
 
-        What an index shows to be outside the cut is not read.
+        Messages that are outside the cut by the index are not read.
         """
         if wanted:
             blocks = self._stored(wanted, cut)
@@ -303,18 +303,18 @@ class Container(ABC):
 
     @abstractmethod
     def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
-        """Yield what `blocks` does, each message as it is stored."""
+        """Yield the blocks of `blocks` with messages as they are stored, compressed or not."""
 
     @abstractmethod
     def span_ns(self) -> tuple[int, int] | None:
-        """Return the log times of the first and the last message, None where only reading the log shows them."""
+        """Return the log times of the first and the last message; None without an index."""
 
     @abstractmethod
     def share_read(self) -> float:
         """Return the share of the log that has been read, 0 to 1."""
 
     def close(self) -> None:
-        """Release files, and remove what was made for it."""
+        """Close the files of the log, and remove its temporary files."""
         self.origin.remove()
 
     @cached_property
