@@ -1,1 +1,1 @@
-"""Results to files: run directory, tables, figures, exports. No metric is computed here."""
+"""Write results to files: run directory, tables, figures, exports. This package computes no metric."""

@@ -63,16 +63,16 @@ def write_report(
 
     Parameters
     ----------
-    analyse : gives the report; it is called with the sink for single trials, None where trials are not written
+    analyse : returns the report. It is called with the sink for single trials, None if trials are not written
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     figures : ``all``: the paper's figures too
-    stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: trials are not written
+    stamp_ns : stamps (n,) of the starts, for trials.parquet with every single trial; None: trials are not written
     watch : called with the name of each picture before it is drawn
 
     Raises
     ------
     OutputError
-        Something that is not a dropout report is in its place or among its files, or the disk does not take it.
+        A file or directory that is not from a dropout report is in the place of the report, or writing fails.
     """
     of_run, name = path_of(directory).parent, path_of(directory).name
     with atomic_directory(directory, REPORT) as partial:
@@ -90,7 +90,7 @@ def write_report(
 
 
 def is_dropout_directory(directory: Path) -> bool:
-    """Return whether a directory is a dropout report of ours."""
+    """Return whether a directory is a dropout report that icrtool wrote."""
     return schema_of(Below(directory, REPORT_FILE)).startswith(DROPOUT_FAMILY)
 
 
@@ -135,17 +135,17 @@ WORST_CSV_COLUMNS = (
 
 
 ROWS_A_GROUP = 1 << 18
-"""Number of trials written at a time: 6 MB."""
+"""Number of trials that are written at a time. They take 6 MB of memory."""
 
 
 @contextmanager
 def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
-    """Give a sink that appends trials to a new Parquet file; starts without a trial are left out.
+    """Yield a sink that appends trials to a new Parquet file; starts without a trial are left out.
 
     Parameters
     ----------
-    path : the file to make
-    stamp_ns : (n,) of the starts
+    path : path of the new file
+    stamp_ns : stamps (n,) of the starts
 
     Raises
     ------
@@ -186,11 +186,11 @@ class Baseline:
 
     Attributes
     ----------
-    path : as it was named
-    reports : report.json by name of the log
-    sha256 : of each log's files
-    kinds : robot and group of each log whose run can be used; both may be empty
-    sources : the files that name the reports: fleet.json of a batch, else the reports
+    path : path of the baseline as the user named it
+    reports : path of report.json by name of the log
+    sha256 : SHA-256 of the files of each log
+    kinds : robot and group of each log with a usable run; both may be empty
+    sources : files that list the reports: fleet.json of a batch, else the reports
     """
 
     path: Path
@@ -201,27 +201,27 @@ class Baseline:
 
     @property
     def folder(self) -> Path | None:
-        """The directory that was named; None where it was one report."""
+        """The directory that the user named; None for a single report."""
         return None if self.path.is_file() else self.path
 
     @property
     def digest(self) -> str:
-        """A text that changes with the content."""
+        """Text that identifies the content of the baseline."""
         return sha256(b"".join(read_regular(below(self.folder, file)) for file in self.sources)).hexdigest()
 
     def missing(self, logs: Iterable[str]) -> list[str]:
-        """Return the logs of the baseline that are not among some others, by name."""
+        """Return the names of the logs of the baseline that are not among the given logs."""
         return sorted(set(self.reports) - set(logs))
 
     def find(self, name: str, content: Collection[str], robot: str = "", group: str = "") -> BaselineReport | None:
         """Return the report of the log with the same content, else with the same name, else the robot's drives pooled.
 
-        A baseline of one report file is compared with any log. None where there is nothing to compare with.
+        A baseline of one report file is compared with any log. None if the baseline has no report for the log.
 
         Parameters
         ----------
-        content : SHA-256 of each of its files
-        robot, group : of the log; an empty group is not known, and stands for all
+        content : SHA-256 of each file of the log
+        robot, group : robot and group of the log; an empty group is not known, and means all groups
 
         Raises
         ------
@@ -236,14 +236,14 @@ class Baseline:
         return pooled_baseline(pooled, f"{counted(len(drives), 'drive')} of {escaped(robot)}", str(self.path))
 
     def own_report(self, name: str, content: Collection[str]) -> str | None:
-        """Return which log's report is that of a log; None where it is in none, and only others can stand for it."""
+        """Return the name of the log whose report is the report of a log; None if all reports are of other logs."""
         same_log = next((log for log, files in self.sha256.items() if content and set(content) <= set(files)), None)
         if same_log is None and self.path.is_file():
             same_log = next(iter(self.reports))
         return same_log if same_log is not None else name if name in self.reports else None
 
     def drives_of(self, robot: str, group: str = "") -> list[str]:
-        """Return the usable drives of a robot, in one group where both are known; none of a robot without a name."""
+        """Return the usable drives of a robot, in its group if groups are known; empty for a robot without a name."""
         return [
             log
             for log, (its_robot, its_group) in self.kinds.items()
@@ -251,11 +251,11 @@ class Baseline:
         ]
 
     def check_compares(self, logs: Iterable[tuple[str, Collection[str], str, str]]) -> None:
-        """Refuse a baseline with nothing to compare any of some logs with: a limit on it would never be checked.
+        """Refuse a baseline without a report for any of the logs, because a limit on it would never be checked.
 
         Parameters
         ----------
-        logs : name, content, robot and group of each, as in `find`
+        logs : name, content, robot and group of each log, as in `find`
 
         Raises
         ------
@@ -274,12 +274,12 @@ class Baseline:
 
 
 def open_baseline(path: Path) -> Baseline:
-    """Find the reports of a baseline.
+    """Return the reports of a baseline.
 
     Raises
     ------
     ConfigError
-        There is none, or one cannot be read.
+        The baseline has no report, or a report cannot be read.
     RunError
         The fleet.json of a batch cannot be read.
     """
@@ -313,16 +313,16 @@ def open_baseline(path: Path) -> Baseline:
 
 
 def read_baseline(file: Place, log: str = "") -> BaselineReport:
-    """Read a report.json as a baseline.
+    """Return the report in a report.json as a baseline.
 
     Parameters
     ----------
-    log : its name in a batch; default: the name in the report
+    log : name of the log in a batch; default: the name in the report
 
     Raises
     ------
     ConfigError
-        It is not a dropout report.
+        The file is not a dropout report.
     """
     path = path_of(file)
     try:

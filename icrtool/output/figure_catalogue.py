@@ -31,7 +31,7 @@ ONCE: Parts = {"": ()}
 
 
 def _histograms(report: DropoutReport, *, together: bool) -> Parts:
-    """Return the parts of histograms: one figure of all horizons that have trials, or one of each."""
+    """Return the parts of histograms: one figure of all horizons with trials, or one figure for each horizon."""
     trials = {row.horizon_m: row.trials for row in report.document.trials}
     horizons_m = tuple(metres for metres in HISTOGRAM_HORIZONS_M if trials.get(metres))
     if together:
@@ -44,12 +44,12 @@ class Entry(NamedTuple):
 
     Attributes
     ----------
-    of : kind of its subject
-    title, caption : one line each: what the figure shows, what to look for; ``{}`` is the distance in the file's name
-    place : module and name of its function in ``icrtool.output.figures``
-    parts : suffixes of its files' names, each with further arguments of the function; empty: no figure
-    with_place : its axes may be coordinates of a map grid
-    further : a figure of the paper that is drawn only where all figures are requested
+    of : kind of the subject of the figure
+    title, caption : one line each: content of the figure, and what to look for; ``{}`` is the distance in the name
+    place : module and name of the function that draws the figure, in ``icrtool.output.figures``
+    parts : suffixes of the names of files, each with further arguments of the function; empty: no figure
+    with_place : the axes may be coordinates of a map grid
+    further : a figure of the paper, drawn only if all figures are requested
     """
 
     of: Subject
@@ -62,7 +62,7 @@ class Entry(NamedTuple):
 
     @property
     def draw(self) -> Callable[..., Figure]:
-        """The function that draws it."""
+        """The function that draws the figure."""
         module, _, name = self.place.partition(".")
         function: Callable[..., Figure] = getattr(import_module(f"icrtool.output.figures.{module}"), name)
         return function
@@ -141,7 +141,7 @@ FIGURES = {
         "calibrations.transfer",
     ),
 }  # fmt: skip
-"""All figures by the names of their files. To a name that ends in ``_`` a distance is added."""
+"""All figures by the names of their files. A distance is added to a name that ends with ``_``."""
 
 
 def drive_charts(position_word: str) -> tuple[Chart, ...]:
@@ -196,7 +196,7 @@ def draw_figures(
 
     Parameters
     ----------
-    directory : is made if it does not exist
+    directory : directory of the figures, made if it does not exist
     formats : of ``png``, ``svg`` and ``pdf``
     watch : called with the name of each picture before it is drawn
 

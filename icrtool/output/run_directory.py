@@ -53,8 +53,8 @@ PAGE_FILE = "report.html"
 STATES_FORMATS: tuple[StatesFormat, ...] = get_args(StatesFormat)
 
 MOST_CSV_STATES = 1_000_000
-"""Largest number of states that are written as CSV by default. With more, states.csv has over 300 MB and takes longer
-to read than the log."""
+"""Largest number of states that are written as CSV by default. With more states, states.csv is larger than 300 MB and
+takes longer to read than the log."""
 
 RUN_FAMILY = "icrtool/run/"
 
@@ -73,13 +73,13 @@ def check_target(place: Place, log: Path | None = None, *, overwrite: bool = Fal
 
     Parameters
     ----------
-    log : the run will be made from it; a run of another recording is refused
+    log : log that the run will be made from; a run of another recording is refused
     overwrite : a run of another recording may be replaced
 
     Raises
     ------
     OutputError
-        A file, a directory that is not a run of ours, or the run of another recording is there; or `log` is a run.
+        The place has a file, a directory that is not a run, or the run of another recording; or `log` is a run.
     """
     if log is not None and is_run_directory(log):
         path = next((one.path for one in _inputs_of(log)), "data frames")
@@ -116,7 +116,7 @@ def check_settings(directory: Path, config: Config, request: FitRequest) -> None
     Raises
     ------
     OutputError
-        Another configuration, or another part of the log, was asked of the run that is there.
+        The run in the directory was made with another configuration or of another part of the log.
     """
     if changed := changed_settings(directory, config, request):
         advice = "give them again, name another place (-o, --into), or replace it with --overwrite"
@@ -171,7 +171,7 @@ class _Asked(Record, frozen=True):
 
 
 def _asked_of(directory: Path) -> _Asked | None:
-    """Return the settings of a run whose checksums were not compared yet; None where it cannot be read."""
+    """Return the settings of a run without a check of its checksums; None if the run cannot be read."""
     if isinstance(directory, UrlPath) or not is_run_directory(directory):
         return None
     try:
@@ -197,14 +197,14 @@ def new_run(
     note: Callable[[str], None] | None = None,
     watch: Watch = unwatched,
 ) -> Iterator[Path]:
-    """Write a run and give its new directory; at the end of the block the directory is put in its place.
+    """Write a run to a hidden directory and yield this directory; it is renamed to `directory` at the end of the block.
 
-    Files that the block writes there belong to the run. If the block fails, the old run is unchanged.
+    Files that the block writes into the yielded directory belong to the run. If the block fails, the old run stays.
 
     Parameters
     ----------
-    run : its smoothed states, where it has them, are written as ``smoothed`` in the same format
-    directory : where it shall appear; an old run there is replaced, with all files that were made from it
+    run : the run. Smoothed states are written as ``smoothed`` in the same format
+    directory : place of the run; an old run there is replaced, with all files that were made from it
     states : format of the states; default: ``csv``, for more than `MOST_CSV_STATES` states ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     figures : ``all``: the paper's figures too
@@ -214,7 +214,7 @@ def new_run(
     Raises
     ------
     OutputError
-        A file, another directory or a run with files that icrtool did not write is there, or the disk does not take it.
+        The place has a file, another directory, or a run with files that icrtool did not write; or writing fails.
     """
     if unknown := set(plots) - set(formats.PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {formats.PLOT_FORMATS}")
@@ -224,7 +224,7 @@ def new_run(
             written = f"{len(run.table):,} states: written as states.parquet, not states.csv (--states csv)"
             note(f"{path_of(directory)}: {written}")
     with atomic_directory(directory, RUN) as partial, ThreadPoolExecutor(1) as pool:
-        # The real path: "." would still name the old run after the old run is renamed.
+        # The real path is needed, because "." would still name the old run after its rename.
         place = Path(os.path.realpath(path_of(directory)))
         before = set(names_in(place))
         states_written = pool.submit(run_columns.write_states, run.table, partial / f"states.{states}", states)
@@ -242,13 +242,13 @@ def new_run(
         formats.write_sums(partial, {name: formats.file_b2sum(partial / name) for name in files})
         yield partial
     if note is not None and (gone := before.difference(names_in(place))):
-        # A folder is listed in place of its files.
+        # The list has the name of a folder in place of the names of its files.
         tops = [name for name in sorted(gone) if gone.isdisjoint(f"{one}/" for one in PurePosixPath(name).parents)]
         note(f"{path_of(directory)}: replaced: removed {listed(tops, 5)}")
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:
-    """Return the path of the log whose run a new run replaces; None where it has the same content, or none is there."""
+    """Return the path of the log whose run a new run replaces; None without a run, or for a log of equal content."""
     before, now = _inputs_of(directory), run.document.inputs
     same = [one.identity for one in before] == [one.identity for one in now]
     return str(before[0].path) if before and not same else None
@@ -263,7 +263,7 @@ class _Sources(Record, frozen=True):
 
 
 def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
-    """Return the inputs in a run.json that was not checked."""
+    """Return the inputs in a run.json without a check of its checksum."""
     try:
         return formats.read_document(Below(directory, RUN_FILE), _Inputs, escape=False).inputs
     except (OSError, ValueError, RecursionError):
@@ -271,7 +271,7 @@ def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
 
 
 def is_run_directory(directory: Path) -> bool:
-    """Return whether a directory, or an address, is a run of ours."""
+    """Return whether a directory or an address is a run that icrtool wrote."""
     if isinstance(directory, UrlPath):
         return lies_there(directory, RUN_FILE)
     return formats.schema_of(Below(directory, RUN_FILE)).startswith(RUN_FAMILY)
@@ -286,12 +286,12 @@ RUN = Kind(
 
 
 def is_page(first: bytes) -> bool:
-    """Return whether a file is a page of ours, by its first bytes."""
+    """Return whether icrtool wrote a page, by the first bytes of the file."""
     return b"icrtool</title>" in first
 
 
 def events_csv(events: Sequence[EventDocument]) -> bytes:
-    """Return events.csv: a row an event."""
+    """Return the content of events.csv, with a row for each slip event."""
     return formats.csv_bytes(EVENT_COLUMNS, map(msgspec.structs.astuple, events))
 
 
@@ -302,7 +302,7 @@ NAMES_IN_THE_LOG = ("topic", "message_type")
 
 
 def open_run(path: str | Path, *, whole: bool = True) -> Run:
-    """Read a run directory back, equal to the run that was written.
+    """Return the run in a run directory, equal to the run that was written.
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ def open_run(path: str | Path, *, whole: bool = True) -> Run:
     Raises
     ------
     RunError
-        Not a run directory, one of another version, or one that was edited or cut short since it was written.
+        The directory is no run, is from another version, or was edited or cut off after it was written.
     OutputError
         The address cannot be read.
     """
@@ -323,7 +323,7 @@ def open_run(path: str | Path, *, whole: bool = True) -> Run:
 
 
 def _run_in(directory: Path, place: Path, *, whole: bool) -> Run:
-    """Return the run in a directory on disk; `place`: the place or address that errors name."""
+    """Return the run in a directory on disk; errors name `place`."""
     stored = _read_document(directory)
     sums = formats.read_sums(directory)
     check_sum(directory, RUN_FILE, sums)
@@ -361,7 +361,7 @@ def _run_in(directory: Path, place: Path, *, whole: bool) -> Run:
 
 
 def log_of(run: Run) -> Path:
-    """Return the log a run was made from: its file, or the bag directory its files lie in.
+    """Return the log that a run was made from: its file, or the bag directory with its files.
 
     Raises
     ------
@@ -391,7 +391,7 @@ def newest_run(runs: Path) -> Path:
     Raises
     ------
     RunError
-        There is none.
+        The folder has no run.
     """
     run_files = [file for file in runs.glob(f"*/{RUN_FILE}") if is_run_directory(file.parent)]
     if not run_files:
@@ -419,18 +419,18 @@ def _read_document(directory: Path) -> dict[str, Any]:
     if schema != RUN_SCHEMA:
         why = f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}"
         raise RunError(directory, why, FIT_AGAIN)
-    # Texts from a log in it may be printed from here on.
+    # From here on, texts from a log in run.json are safe to print.
     return {
         key: value if key == "inputs" else escaped_texts(value, NAMES_IN_THE_LOG) for key, value in document.items()
     }
 
 
 def _read_states(directory: Path, stem: str, sums: Mapping[str, str], *, whole: bool) -> States | None:
-    """Read the states of this name, in the run's format; None where the run has none."""
+    """Return the states in the file of this name, CSV or Parquet; None for a run without this file."""
     for states in STATES_FORMATS:
         if (name := f"{stem}.{states}") in sums:
             with ThreadPoolExecutor(1) as pool:
-                # Both threads read the file from end to end; hashing releases the GIL.
+                # Both threads read all of the file. Hashing releases the GIL, so they work at the same time.
                 checked = pool.submit(check_sum, directory, name, sums)
                 try:
                     return run_columns.read_states(Below(directory, name), states, whole=whole)
@@ -440,12 +440,12 @@ def _read_states(directory: Path, stem: str, sums: Mapping[str, str], *, whole: 
 
 
 def check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
-    """Refuse a file of a run whose sum differs from the sum in the list.
+    """Refuse a file of a run whose checksum differs from the checksum in the list.
 
     Raises
     ------
     RunError
-        The sums differ, or the file cannot be read.
+        The checksums differ, or the file cannot be read.
     """
     try:
         digest = formats.file_b2sum(Below(directory, name))

@@ -13,27 +13,27 @@ BLUE, ORANGE, GREEN, RED, PURPLE = "#2166ac", "#e08214", "#1b7837", "#b2182b", "
 """Colours of pictures and exports. `page.css` has them too, with further colours for a dark screen."""
 
 LINE_POINTS = 2400
-"""Approximate number of points of a drawn line: some three per pixel column of every figure."""
+"""Approximate number of points of a drawn line: about three for each pixel column of a figure."""
 
 SAMPLED_ROWS = 40_000
 """Approximate number of rows from which the range of a column is found for drawing."""
 
 TYPICAL_PERCENT, HEADROOM = 99.5, 1.6
-"""Percentile of differences, and the ratio of the end of their scale to it. A few outliers do not flatten the rest."""
+"""Percentile of differences, and ratio of the end of their scale to it. Outliers have no effect on the scale."""
 
 LEAST_END_M = 0.001
 """Smallest end of a scale of differences [m]."""
 
 RANGE_PERCENT = (0.2, 99.8)
-"""Percentiles of a column between which its range is shown. One spike does not flatten the rest."""
+"""Percentiles of a column that limit its shown range, so that a single spike has no effect on the scale."""
 SCALE_MARGIN, LEAST_HALF_RANGE_M = 1.12, 0.02
 
 BREAK_SHARE, BREAK_IN_INTERVALS = 0.01, 5.0
-"""Shortest gap over which no line is drawn: this share of the time, and this many usual intervals."""
+"""Shortest gap over which no line is drawn: the share of the whole time, and the number of usual intervals."""
 
 
 def every_so_many(rows: int, most: float) -> tuple[Ints, int]:
-    """Choose about `most` of `rows` rows at an equal step, and the last row; return the rows and the step."""
+    """Return about `most` of `rows` rows at an equal step and the last row, and the step."""
     every = max(math.ceil(rows / most), 1)
     return np.unique(np.append(np.arange(0, rows, every), rows - 1)), every
 
@@ -44,7 +44,7 @@ def round_steps(length: float) -> Floats:
 
 
 def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
-    """Choose rows such that a line through them shows every extreme of every column.
+    """Return rows such that a line through them shows every extreme of every column.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def percentiles(column: Floats, shares: tuple[float, ...]) -> list[float]:
 
 
 def places(north: Floats, east: Floats, cell_m: float) -> Ints:
-    """Choose the rows of a path at which it enters another cell of a square grid.
+    """Return the rows at which a path enters another cell of a square grid.
 
     Parameters
     ----------

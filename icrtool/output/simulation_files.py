@@ -41,17 +41,17 @@ def truth_path(log: Path) -> Path:
 
 @contextmanager
 def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
-    """Give hidden paths to write a log and its truth to; put both in place when the block ends well.
+    """Yield hidden paths for a log and its truth; both are renamed to their places when the block ends without error.
 
     Parameters
     ----------
-    log : where the log shall appear; its truth appears at `truth_path`
-    force : replace what is there, if it is a log (a file, or a bag directory)
+    log : place of the log; the place of its truth is `truth_path`
+    force : replace an existing log (a file, or a bag directory)
 
     Raises
     ------
     OutputError
-        Something is there, or the place cannot be written. It then stays as it was.
+        The place is taken, or it cannot be written. The place is then unchanged.
     """
     if not log.name:
         raise OutputError(log, "has no name for a log", "name an .mcap or .bag file, or a directory in it")
@@ -85,7 +85,7 @@ BAG = Kind(
 
 
 def write_truth(table: TruthTable, path: Path) -> None:
-    """Write the truth, each number in the shortest form that is exact."""
+    """Write the truth; each number has the fewest digits that are exact."""
     import pyarrow as pa
     import pyarrow.csv as pc
 
@@ -97,12 +97,12 @@ def write_truth(table: TruthTable, path: Path) -> None:
 
 
 def read_speeds(path: Path) -> TrackSpeeds:
-    """Read track speeds from a CSV with columns ``t_s, v_left_mps, v_right_mps``; other columns are ignored.
+    """Return the track speeds in the columns ``t_s, v_left_mps, v_right_mps`` of a CSV; other columns are ignored.
 
     Raises
     ------
     DataError
-        A file that cannot be read, or without usable columns; times that do not increase.
+        The file cannot be read or has no usable columns, or the times do not increase.
     """
     t, left, right = read_numbers(path, SPEED_COLUMNS).values()
     if not np.isfinite([t, left, right]).all():
@@ -125,7 +125,7 @@ def check_study_target(directory: Path) -> None:
     Raises
     ------
     OutputError
-        A file, a directory that is not a study, or a study with files that icrtool did not write is there.
+        The place has a file, a directory that is not a study, or a study with files that icrtool did not write.
     """
     check_directory(directory, STUDY)
 
@@ -135,13 +135,13 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
 
     Parameters
     ----------
-    directory : where they shall appear; an old study there is replaced
+    directory : folder of the study; an old study there is replaced
     plots : formats of the picture, of ``png``, ``svg`` and ``pdf``
 
     Raises
     ------
     OutputError
-        As `check_study_target`, and the disk does not take it.
+        `check_study_target` refuses the place, or the files cannot be written.
     """
     name = result.request.name
     document = {

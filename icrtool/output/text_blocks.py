@@ -37,7 +37,7 @@ BRIEF, VERBOSE, PAGE = 0, 1, 2
 
 
 class Title(NamedTuple):
-    """Subject of a document, and the amount of data behind it; `about`: a sentence that only a wide page shows."""
+    """Subject of a document, and the amount of its data. `about` is a sentence that only a wide page shows."""
 
     text: str
     facts: str
@@ -80,11 +80,11 @@ class Table(NamedTuple):
     align : ``l`` or ``r`` for each column; the last one holds for the columns after it too
     rows : a cell a column; a row of a searched table may have fewer cells, of which the last is a sentence
     head : names of the columns; empty: none
-    caption : what it shows
-    moments : times at which the rows begin [s], which a page shows on its map; empty: none
+    caption : sentence about the content
+    moments : begin of each row [s], which a page shows on its map; empty: no times
     search : for each row the `words` that a page searches, and by name the values for its lists of choices. A page also
         sorts such a table; empty: it does neither
-    folded : names of the columns that a page shows only when they are asked for
+    folded : names of the columns that a page shows only after a click
     """
 
     align: str
@@ -113,11 +113,11 @@ class Table(NamedTuple):
 
 
 class Facts(NamedTuple):
-    """Labelled sentences; one without a label goes on with what is above it, and an empty one is left out.
+    """Labelled sentences. A sentence without a label continues the sentence above it; an empty sentence is left out.
 
     Attributes
     ----------
-    label : of all of them together: names and numbers then stand in two columns
+    label : common label of all sentences; names and numbers then stand in two columns
     """
 
     rows: Sequence[tuple[str, str]]
@@ -125,7 +125,7 @@ class Facts(NamedTuple):
 
 
 class Check(NamedTuple):
-    """Something that was checked, and the finding; `more`: its details. A fact is neither good nor bad."""
+    """A check and its finding; `more` has the details. A fact is a check that is neither good nor bad."""
 
     grade: Grade
     what: str
@@ -134,7 +134,7 @@ class Check(NamedTuple):
 
 
 class Checks(NamedTuple):
-    """What was checked."""
+    """A list of checks."""
 
     rows: Sequence[Check]
 
@@ -213,7 +213,7 @@ def stated_blocks(blocks: Iterable[Block]) -> Iterator[Block]:
 
 
 def format_blocks(blocks: Iterable[Block], *, verbose: bool = True) -> str:
-    """Return a document as plain text, at most `TEXT_WIDTH` wide where it can be wrapped; no line end."""
+    """Return a document as plain text without the last line end, wrapped to `TEXT_WIDTH` where possible."""
     lines: list[str] = []
     for block in printed_parts(blocks, verbose=verbose):
         if isinstance(block, Table):
@@ -373,5 +373,5 @@ def _markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
 def _escaped_markdown(text: str) -> str:
     """Return text with Markdown's markup characters escaped."""
     plain = re.sub(r"([\\`*_{}\[\]<>|#~&$])", r"\\\1", escaped(" ".join(text.split())))
-    # GitHub and GitLab notify whom an @ names, also behind an escape: a word joiner parts it from the name
+    # GitHub and GitLab notify the user whose name follows an @, even after an escape. A word joiner prevents this.
     return plain.replace("@", "@\u2060")

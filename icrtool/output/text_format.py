@@ -44,12 +44,12 @@ def run_title(summary: RunDocument) -> str:
 
 
 def position_word(summary: RunDocument) -> str:
-    """Return the words for the position measurements: fixes of a receiver, or a reference that was metric already."""
+    """Return the words for the position measurements: ``GNSS fixes``, or ``position reference`` for metric poses."""
     return "GNSS fixes" if summary.gnss.datum is not None else "position reference"
 
 
 def fix_word(summary: RunDocument) -> str:
-    """Return the word for what an outage lacks: ``GNSS``, or ``position`` for a reference that was metric already."""
+    """Return the word for the missing stream of an outage: ``GNSS``, or ``position`` for a metric reference."""
     return "GNSS" if summary.gnss.datum is not None else "position"
 
 
@@ -59,7 +59,7 @@ def direction_words(summary: RunDocument | None) -> tuple[str, str]:
 
 
 def role_word(summary: RunDocument, role: Role) -> str:
-    """Return the word for a stream: a position reference that was metric already is not called GNSS."""
+    """Return the word for the stream of a role; ``position`` for a metric reference, which is not called GNSS."""
     return ROLE_WORDS[role] if summary.gnss.datum is None else role
 
 
@@ -85,7 +85,7 @@ def _jump_size(jump: ReferenceJumpDocument) -> str:
 
 
 def jump_count(jumps: Sequence[ReferenceJumpDocument]) -> str:
-    """Return how often the reference jumps, as ``2 jumps of the reference, up to 3.1 m``; empty where it does not."""
+    """Return the number of jumps as ``2 jumps of the reference, up to 3.1 m``; empty without jumps."""
     decided = [one for one in jumps if not one.undecided]
     undecided = f"{counted(len(jumps) - len(decided), 'step')} of undecided cause" if len(jumps) > len(decided) else ""
     if not decided:
@@ -144,13 +144,13 @@ def controller_error_text(errors: ControllerErrors | None) -> str:
 
 
 def turn_text(degrees: float) -> str:
-    """Return a turn as ``62° right``, and ``0°`` for what rounds to it."""
+    """Return a turn as ``62° right``; ``0°`` for a turn below half a degree."""
     size = f"{abs(degrees):.0f}°"
     return size if size == "0°" else f"{size} {'right' if degrees >= 0 else 'left'}"
 
 
 def error_text(metres: float | None) -> str:
-    """Return an error as ``0.0034 m``, ``0.123 m`` or ``3.45 m``: one unit, and the same digits, in all places."""
+    """Return an error [m] with 4 decimals below 0.01 m, 3 below 1 m, and 2 above: ``0.0034 m``, ``3.45 m``."""
     if metres is None or not math.isfinite(metres):
         return "-"
     return f"{metres:.{4 if metres < 0.01 else 3 if metres < 1 else 2}f} m"

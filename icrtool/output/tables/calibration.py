@@ -77,7 +77,7 @@ def _held_out_distance(reached: BudgetDistance) -> tuple[str, str, str]:
 
 
 def calibration_file_blocks(calibration: Calibration, title: str) -> list[Block]:
-    """Return what the page of a calibration file states: numbers, errors on other distance, parameters, logs."""
+    """Return the page of a calibration file as blocks: numbers, held-out errors, parameters, logs."""
     icrs = [(calibration.geometry[name], calibration.geometry_std[name]) for name in ICR_COLUMNS]
     driven = distance_text(sum(log.distance_m for log in calibration.logs))
     robot, model = calibration.robot.name or "robot", model_text(calibration.fitted)
@@ -89,7 +89,7 @@ def calibration_file_blocks(calibration: Calibration, title: str) -> list[Block]
         configuration = configuration_blocks(calibration, "CAL.json")
     unknown = "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown)
     table = parameter_table(calibration.fitted, calibration.fitted_with_gyro)
-    # a reader knows the meaning, a file has the term
+    # the page states the meaning of a term, the file its name
     named = [
         (f"{WITH_GYRO}{meaning}" if term.startswith(WITH_GYRO) else meaning, *middle, term.removeprefix(WITH_GYRO))
         for term, *middle, meaning in (map(str, row) for row in table.rows)
@@ -153,7 +153,7 @@ def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) 
 
 
 def _reach_card(found: Calibration) -> Section:
-    """Return how far the robot stays within the budget on distance that was not fitted, and the errors there."""
+    """Return the distance within the budget and the errors, both held out of the fit, as a card."""
     horizons = sorted({one.horizon_m for one in found.held_out_pooled})
     pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
     names = in_order({one.model for one in found.held_out_pooled})
@@ -177,7 +177,7 @@ def _reach_card(found: Calibration) -> Section:
 
 
 def _held_out_table(found: Calibration) -> Table:
-    """Return p95 and expected error by horizon of each row, over all that was left out."""
+    """Return p95 and expected error by horizon of each row, over all held-out trials."""
     horizons = sorted({one.horizon_m for one in found.held_out_pooled})
     pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
     names = in_order({one.model for one in found.held_out_pooled})
@@ -265,7 +265,7 @@ SHOWN_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 
 def forecast_csv(forecast: Forecast, gyro: Forecast | None = None) -> str:
-    """Return a row for each metre."""
+    """Return a forecast as CSV, with a row for each metre."""
     columns = _columns(forecast, gyro)
     lines = [",".join(columns)]
     lines += [",".join(f"{value:.6g}" for value in row) for row in zip(*columns.values(), strict=True)]
@@ -273,7 +273,7 @@ def forecast_csv(forecast: Forecast, gyro: Forecast | None = None) -> str:
 
 
 def _columns(forecast: Forecast, gyro: Forecast | None) -> dict[str, Floats]:
-    """Return the columns of a forecast, last the errors with a gyro."""
+    """Return the columns of a forecast; the last columns are the errors with a gyro."""
     error = {"expected_m": "expected_error_m", "p95_m": "p95_error_m"}
     columns = {error.get(name, name): column for name, column in forecast._asdict().items()}
     if gyro is not None:

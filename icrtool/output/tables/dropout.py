@@ -1,4 +1,4 @@
-"""A dropout report as blocks: how far without GNSS, whether to trust it, where it was worst, and all errors."""
+"""A dropout report as blocks: distance without GNSS, reasons for trust, worst trials, and all errors."""
 
 from __future__ import annotations
 
@@ -66,22 +66,22 @@ NEXT_DRIVE_MEANS = "next drive: this robot, this kind of ground"
 
 
 def format_dropout(report: DropoutReport) -> str:
-    """Return the text that is printed of a report, without the last line end."""
+    """Return a report as text, without the last line end."""
     return format_blocks(dropout_blocks(report))
 
 
 def dropout_blocks(report: DropoutReport) -> list[Block]:
-    """Return what `icrtool dropout-report` prints, with the differences to a baseline where there is one."""
+    """Return the output of `icrtool dropout-report` as blocks, with the differences from a baseline if given."""
     *blocks, verdicts = report_blocks(report.run_document, report.document)
     return [*blocks, *baseline_sections(report), verdicts]
 
 
 def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
-    """Return what is printed of a report as it is stored, the verdicts last.
+    """Return a stored report as blocks, with the verdicts last.
 
     Parameters
     ----------
-    summary : of the run
+    summary : content of run.json
     report : content of report.json; null for a number that is not known
     """
     summary = with_verdict(summary, report)
@@ -138,7 +138,7 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
     first = sorted(shown_rows(order), key=lambda name: name != best)
     notes = {one.name: one.fitted for one in report.calibrations}
     notes |= {one.name: one.knows for one in report.models if kind_of(one.name) == TOPIC_ROW}
-    # with a calibration this row has other numbers than without one
+    # a given calibration changes the numbers of this row
     learned = (one for one in report.models if kind_of(one.name) == "adaptive")
     notes |= {one.name: "from the calibration" for one in learned if not one.knows.startswith(OTHER_ROBOTS)}
     if report.best is not None:
@@ -162,7 +162,7 @@ def reach_row(distance: BudgetDistance, note: str = "") -> ReachRow:
 
 
 def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
-    """Return how far the robot stays within each budget, on this drive and on the next one."""
+    """Return the distances over which the robot stays within each budget, on this drive and on the next drive."""
     blocks: list[Block] = []
     lead, text = "", ""
     others_known = list(other_ground_lines(report))
@@ -188,7 +188,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
 def _distance_to_plan_with(report: DropoutDocument, budget_m: float, row: ReachRow) -> tuple[str, str]:
     """Return the distance that the next drive keeps in 9 of 10 cases, and in a sentence the distance on this drive.
 
-    Where nothing is expected of the next drive, the distance on this drive is the answer.
+    If the distance of the next drive is not known, the distance on this drive is returned.
     """
     name, this_drive, next_drive, _ = row
     measured = f"within {budget_m:g} m (95 %), by wheel speeds alone with {name}"
@@ -200,7 +200,7 @@ def _distance_to_plan_with(report: DropoutDocument, budget_m: float, row: ReachR
 
 
 def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
-    """Yield how far the robot stays within each budget on a ground that the calibration was not fitted to."""
+    """Yield the distance within each budget on a ground that the calibration was not fitted to."""
     grounds = {
         score.ground
         for used in report.calibrations
@@ -231,7 +231,7 @@ def sensor_lines(report: DropoutDocument) -> Iterator[str]:
 
 
 def as_good_lines(report: DropoutDocument) -> Iterator[str]:
-    """Yield which rows for comparison are as good as the best row."""
+    """Yield a line with the rows for comparison that are as good as the best row."""
     for name in report.best.as_good if report.best is not None else ():
         yield f"{name} ({row_of(name).words}) is not shown to be worse: it needs no calibration"
 
@@ -350,7 +350,7 @@ def model_section(report: DropoutDocument) -> Section:
 
 
 WITH_GYRO = "with gyro: "
-"""Before the names of parameters of a model with a gyro."""
+"""Prefix of the names of parameters of a model with a gyro."""
 
 
 def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:

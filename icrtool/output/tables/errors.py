@@ -1,4 +1,4 @@
-"""Errors over distance as blocks: of the models that count, of all others, and what they rest on."""
+"""Errors over distance as blocks: of the shown models, of all other models, and the data behind the errors."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
 LISTED_HORIZONS = 4
-"""More horizons than this without a trial are printed as a range."""
+"""Largest number of horizons without a trial that are listed; more horizons are printed as a range."""
 
 NOTED_STANDING = 0.05
-"""From this share of standing states on, they are mentioned."""
+"""Smallest share of standing states that is printed."""
 
 SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 
@@ -33,7 +33,7 @@ NO_TRIAL = {
     "ends_in_gnss_outage": "  ends in GNSS outage", "from_standstill": "  from standstill",
     "crosses_jump": "  across a reference jump", "across_slip_event": "  across a slip event",
 }  # fmt: skip
-"""Why starts gave no trial, by the keys of report.json."""
+"""Reasons why starts gave no trial, by the keys of report.json."""
 
 
 def shown_horizons(horizons_m: Floats) -> list[int]:
@@ -63,7 +63,7 @@ def trials_of_first(report: DropoutDocument) -> list[int]:
 
 
 def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
-    """Return the errors over distance: what counts first, then all of them, and what they rest on."""
+    """Return the errors over distance: of the shown rows, then of all rows, and the data behind them."""
     horizons = shown_horizons(np.array([row.horizon_m for row in report.trials]))
     counts = [report.trials[h] for h in horizons]
     main, models = shown_rows([one.name for one in report.models]), in_row_order(report.models)
@@ -96,7 +96,7 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
 
 
 def _error_row(model: ModelDocument, horizons: Sequence[int]) -> list[str | Cell]:
-    """Return 95 %, its interval and the expected error of a model."""
+    """Return the 95th percentile of a model's errors, its interval, and the expected error [m]."""
     cells = []
     for row in (model.by_horizon[h] for h in horizons):
         low, high = row.p95_low_m, row.p95_high_m
@@ -112,7 +112,7 @@ def _error_cell(horizon_m: float, p95_m: float | None, expected_m: float | None,
 
 
 def _other_rows(report: DropoutDocument, horizons: Sequence[int]) -> Iterator[list[str | Cell]]:
-    """Yield what a perfect model would show, what the ICRs gain, and why starts gave no trial."""
+    """Yield rows with the errors of a perfect model, the gain by the ICRs, and why starts gave no trial."""
     kinds, icr, no_slip = Cell("95 %", more=("expected",)), model_of(report, "icr"), model_of(report, "no_slip")
     if any(row.p95_m is not None for row in report.reference_error):
         reference = (report.reference_error[h] for h in horizons)
@@ -131,7 +131,7 @@ def _other_rows(report: DropoutDocument, horizons: Sequence[int]) -> Iterator[li
 
 
 def _source_lines(report: DropoutDocument) -> Iterator[str]:
-    """Yield what the numbers of each model were learned from, and how much can be the reference's own error."""
+    """Yield the data that each model was fitted to, and the part of its error that the reference can explain."""
     learned: dict[str, list[str]] = {}
     for one in report.models:
         learned.setdefault(one.knows, []).append(one.name)
@@ -147,7 +147,7 @@ def _source_lines(report: DropoutDocument) -> Iterator[str]:
 
 
 def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]:
-    """Yield which trials count, what slip events cost, and why horizons are empty."""
+    """Yield lines with the trials that count, the cost of slip events, and why horizons are empty."""
     smoothed = "; compared with the smoothed trajectory, which knows all of the drive"
     reference = smoothed if report.request.reference == "smoothed" else ""
     moving = "moving " if report.request.starts == "moving" else ""
@@ -173,7 +173,7 @@ def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]
 
 
 def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
-    """Return what slip events cost, at the longest horizon with trials on both sides."""
+    """Return the errors with and without slip events, at the longest horizon with both kinds of trials."""
     cost, icr, events = report.without_events, model_of(report, "icr"), summary.events
     if cost is None and events:
         lasted = duration_text(sum(event.end_s - event.begin_s for event in events))

@@ -1,4 +1,4 @@
-"""A run as blocks: may it be used, the numbers, what was checked, and where they come from."""
+"""A run as blocks: whether it can be used, the numbers, the checks, and the sources of the numbers."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def format_run(run: Run) -> str:
 
 
 def run_blocks(summary: RunDocument) -> list[Block]:
-    """Return what `icrtool fit` prints of a run: usable or not, the numbers, why to trust them, where they are from."""
+    """Return the output of `icrtool fit` as blocks: usability, numbers, checks, and sources of the numbers."""
     excitation = summary.excitation
     turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
     driven = f"{distance_text(summary.drive.distance_m)}, {duration_text(summary.drive.duration_s)}"
@@ -113,7 +113,7 @@ def run_blocks(summary: RunDocument) -> list[Block]:
 
 
 def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
-    """Return where a run was written, and what to do next; `examine`: command that names what is wrong in its log."""
+    """Return the place of a run, and the next step; `examine` is the command that finds the problem of its log."""
     command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
     if (stretches := unstated_grounds(summary)) and summary.inputs:
         times = [word for one in stretches[1:] for word in ("--terrain-change", f"{one.begin_s:.0f}")]
@@ -140,7 +140,7 @@ def _stretch_rows(stretches: Sequence[GroundStretch]) -> list[Row]:
 
 
 def next_line(command: str) -> Line:
-    """Return the command to run next on one line, however long: it is copied; empty without a command."""
+    """Return the next command on one line, which is not wrapped so that it can be copied; empty without a command."""
     return Line(f"{'next':12}{command}" if command else "", "as is")
 
 
@@ -204,7 +204,7 @@ def _icr_row(icrs: Sequence[tuple[float, float] | None]) -> Row:
 
 
 def run_checks(summary: RunDocument) -> list[Check]:
-    """Return what was checked of a run, each with its finding and its details."""
+    """Return the checks of a run, each with its finding and its details."""
     checks = [*_filter_check(summary), excitation_check(summary)]
     checks += [*_fix_checks(summary), *_heading_checks(summary), *_delay_checks(summary)]
     if spans := summary.outages_ns:
@@ -242,7 +242,7 @@ def _filter_check(summary: RunDocument) -> Iterator[Check]:
 
 
 def excitation_check(summary: RunDocument) -> Check:
-    """Return what the drive could show of the ICRs; where one is not shown, what to drive."""
+    """Return the check of the information about the ICRs; for an ICR that is not shown, what to drive."""
     excitation, drive = summary.excitation, to_drive(summary)
     spun = excitation.spun_right_deg + excitation.spun_left_deg
     turned = f"turned {excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
@@ -255,13 +255,13 @@ def excitation_check(summary: RunDocument) -> Check:
         f"{', '.join(name for one, name in weak if one == verdict)} {verdict}"
         for verdict in dict.fromkeys(one for one, _ in weak)
     )
-    # what was lacking is printed with the ICRs, what to drive on a line of its own
+    # The missing information is printed with the ICRs, and what to drive on a further line.
     lacks = drive.rpartition(": ")[2]
     return Check("care", "excitation", f"{words}{f': {lacks}' if lacks else ''}", more)
 
 
 def _fix_checks(summary: RunDocument) -> Iterator[Check]:
-    """Yield how many positions were used, how near the filter is to them, and how often they jump."""
+    """Yield checks of the positions: number of used positions, distance of the filter from them, and jumps."""
     gnss, word = summary.gnss, position_word(summary)
     if of := gnss.used + gnss.rejected:
         reasons = {"gate": gnss.rejected_by_gate, **gnss.rejected_by_reason}
@@ -287,7 +287,7 @@ def _fix_checks(summary: RunDocument) -> Iterator[Check]:
 
 
 def _heading_checks(summary: RunDocument) -> Iterator[Check]:
-    """Yield how far the heading is from the course over ground, and where it comes from."""
+    """Yield checks of the heading: its difference from the course over ground, and its source."""
     heading = summary.heading
     gate = f", {heading.rejected:,} rejected (gate)" if heading.rejected else ""
     more = [f"{heading.source.replace('_', ' ')}: {heading.parts}"] if heading.parts else []
@@ -304,7 +304,7 @@ def _heading_checks(summary: RunDocument) -> Iterator[Check]:
 
 
 def _delay_checks(summary: RunDocument) -> Iterator[Check]:
-    """Yield which streams seem to lag or lead the wheels."""
+    """Yield a check for each stream that seems to lag or lead the wheels."""
     if summary.filter.reference_delay_s or summary.heading.applied_delay_s:
         return
     checks = []
@@ -342,9 +342,9 @@ def corrections(summary: RunDocument) -> list[str]:
 
 
 def to_drive(summary: RunDocument) -> str:
-    """Return what to drive to find the ICRs that a run does not show; empty where turns would not help.
+    """Return what to drive to find the ICRs that a run does not show; empty if turns would not help.
 
-    With a wrong wheel radius they do not: the filter then rejects what the drive shows.
+    Turns do not help if the wheel radius is wrong, because the filter then rejects the measurements.
     """
     excitation = summary.excitation
     if scale_is_wrong(summary):
