@@ -96,7 +96,7 @@ def _message_ends(data: Bytes, at: Ints) -> Ints:
 
 
 def _message_heads(data: Bytes, at: Ints) -> NDArray[Any]:
-    """Return the heads (n,) of messages."""
+    """Return the head of each message (n,)."""
     together: NDArray[Any] = values_at_each_byte(data, f"V{_MESSAGE_HEADS.itemsize}")[at].view(_MESSAGE_HEADS)
     return together
 
@@ -201,7 +201,7 @@ class McapFile(ChunkedFile):
         return chunks
 
     def _summary(self) -> tuple[int, bytes]:
-        """Return where the summary begins, and its records; none where it is damaged."""
+        """Return the begin of the summary and its records; no records if the summary is damaged."""
         end = self._size - len(MCAP_MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
         footer = self._source.read_at(max(end, 0), _HEAD_BYTES + _FOOTER_BYTES)
         start = int.from_bytes(footer[9:17], "little")
@@ -248,7 +248,7 @@ class McapFile(ChunkedFile):
         return True
 
     def _chunks_in_order(self, end: int) -> int:
-        """Return how many chunks are among the records that follow one another up to `end`, 0 where they do not."""
+        """Return the number of chunks among the records up to `end`; 0 if the records do not follow one another."""
         at, count = len(MCAP_MAGIC), 0
         while at < end:
             opcode, length = self._head(at)
@@ -258,7 +258,7 @@ class McapFile(ChunkedFile):
         return count if at == end else 0
 
     def _head(self, at: int) -> tuple[int, int]:
-        """Return opcode and length of the record at a file offset; opcode 0 where there is none."""
+        """Return opcode and length of the record at a file offset; opcode 0 without a record."""
         head = self._source.read_at(at, _HEAD_BYTES) if 0 <= at < self._size else b""
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
@@ -341,7 +341,7 @@ class McapFile(ChunkedFile):
 
 
 def _parse(opcode: int, content: bytes) -> Any:  # noqa: ANN401 - a chunk, or a record of the library
-    """Return what a chunk index, schema, channel or statistics record holds, None where it is damaged."""
+    """Return the content of a chunk index, schema, channel or statistics record; None for a damaged record."""
     from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
     from mcap.records import Channel, Schema, Statistics

@@ -110,7 +110,7 @@ FileState = tuple[int, int, int]
 
 
 def states_of(path: Path) -> dict[str, FileState]:
-    """Return by path what changes when a file of a log is written to; nothing for an address."""
+    """Return by path the state of each file of a log, which changes when the file is written; empty for an address."""
     states: dict[str, FileState] = {}
     for file in () if isinstance(path, UrlPath) else files_of_log(path):
         with suppress(OSError):
@@ -130,7 +130,7 @@ def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterabl
     Raises
     ------
     LogChangedError
-        It was.
+        The log was written to while it was read.
     """
     if isinstance(path, UrlPath):
         changed = changed_since(path, inputs)
@@ -237,7 +237,7 @@ def _brought(
 
 
 def _is_packed_file(path: Path) -> bool:
-    """Return whether there is a file that `unpack` reads."""
+    """Return whether a path is a file that `unpack` reads."""
     if not path.is_file():
         return False
     with path.open("rb") as stream:
@@ -245,7 +245,7 @@ def _is_packed_file(path: Path) -> bool:
 
 
 def _usable(container: Container, path: Path) -> Container:
-    """Return a container with the channels that are looked at; refuse one without any."""
+    """Return a container with the channels that icrtool reads; refuse a container without channels."""
     if (count := len(container.channels)) > MOST_CHANNELS:
         kept = sorted(container.channels, key=lambda channel: -(channel.count or 0))[:MOST_CHANNELS]
         container.channels = sorted(kept, key=lambda channel: channel.id)
@@ -274,7 +274,7 @@ def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType(
 
 
 def container_of(stream: BinaryIO) -> type[McapFile | Ros1Bag | SqliteBag] | None:
-    """Return which container the first bytes of a file are of; None where it is no log."""
+    """Return the type of container by the first bytes of a file; None for a file that is no log."""
     stream.seek(0)
     start = stream.read(max(map(len, _CONTAINERS)))
     return next((container for magic, container in _CONTAINERS.items() if start.startswith(magic)), None)
@@ -331,7 +331,7 @@ class BagDirectory(Container):
         return super().problems + [problem for part in self._parts.values() for problem in part.problems]
 
     def share_read(self) -> float:
-        """Return the mean over the files, which are read one after the other."""
+        """Return the share of the log that has been read, 0 to 1: the mean of the shares of the files."""
         return (self._reading + [*self._parts.values()][self._reading].share_read()) / len(self._parts)
 
     def close(self) -> None:
@@ -343,7 +343,7 @@ class BagDirectory(Container):
         super().close()
 
     def span_ns(self) -> tuple[int, int] | None:
-        """Return first and last log time of all files, None where one of them has no index."""
+        """Return first and last log time of all files; None if any file has no index."""
         known = [span for part in self._parts.values() if (span := part.span_ns()) is not None]
         if len(known) < len(self._parts):
             return None

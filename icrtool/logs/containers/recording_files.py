@@ -43,7 +43,7 @@ LEAST_OVERLAP_S = 1.0
 
 
 class FileTimes(NamedTuple):
-    """First and last log time of a file's messages [ns]."""
+    """First and last log time of the messages of a file [ns]."""
 
     begin_ns: int
     end_ns: int
@@ -206,7 +206,7 @@ def is_bag_directory(folder: Path) -> bool:
 
 
 def check_spans(directory: Path, spans: Sequence[FileTimes]) -> list[str]:
-    """Compare the log times of files that were found by name.
+    """Return the overlaps between the log times of files that were found by name.
 
     Returns
     -------
@@ -234,7 +234,7 @@ def check_spans(directory: Path, spans: Sequence[FileTimes]) -> list[str]:
 
 
 def unpacked_name(name: str) -> str:
-    """Return a file's name without the suffixes of compression and archives: ``a.mcap`` of ``a.mcap.zst``."""
+    """Return the name of a file without suffixes of compression and archives: ``a.mcap`` for ``a.mcap.zst``."""
     return _ARCHIVE_END.sub("", _PACKED_END.sub("", name))
 
 
