@@ -227,13 +227,12 @@ def test_sensors_are_refitted_only_for_a_calibration(
     assert list(run_place.iterdir()) == []
 
 
-def test_a_calibration_is_refused_for_the_page_of_a_finished_run(
+def test_a_calibration_of_another_width_is_refused_for_the_page_of_a_finished_run(
     icrtool: Command, run_directory: Path, other: Path
 ) -> None:
     status, _, errors = icrtool("report", run_directory, "--calibration", other)
     assert status == 1
-    assert "is not a log" in errors
-    assert "icrtool dropout-report RUN --calibration" in errors
+    assert "robot.track_width_m: 0.6 m, the calibration is of a robot" in errors
     assert not (run_directory / "report.html").exists()
 
 

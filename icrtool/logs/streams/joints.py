@@ -135,8 +135,12 @@ def _most_repeated(sums: NDArray[np.float64]) -> Bools:
     return np.asarray(sums == values[int(np.argmax(count))])
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _alternates(columns: Sequence[NDArray[Any]], repeated: Bools) -> bool:
-    """Return whether repeated messages (n,) lie between others that hardly differ, compared with the repeated state."""
+    """Return whether repeated messages (n,) lie between others that hardly differ, compared with the repeated state.
+
+    Differences of values near the largest number overflow; such messages do not alternate.
+    """
     others = np.flatnonzero(~repeated)
     around = np.flatnonzero(np.diff(others) > 1)
     if len(around) < FEWEST_REPEATED or not columns:
