@@ -12,11 +12,10 @@ import re
 import shutil
 import socket
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from ipaddress import ip_address
 from pathlib import Path
 from random import Random
@@ -30,7 +29,7 @@ sys.path[:0] = [str(ROOT / "scripts"), str(ROOT / "tests")]
 from fuzz_runs import called  # noqa: E402 - beside this script
 
 from support.batches import in_this_process  # noqa: E402 - the tests are no package
-from support.servers import SECRET, object_store  # noqa: E402
+from support.servers import SECRET, AnsweringHandler, object_store, web_server  # noqa: E402
 
 COMMANDS = (
     ("info", "A"), ("info", "A", "--json"), ("info", "A", "LOG"), ("fit", "A", "--plots", "none"),
@@ -142,29 +141,19 @@ def make_address(random: Random, port: int) -> OddAddress:
 def servers(log: Path) -> Iterator[int]:
     """Serve a log at every address of a web server, and at odd names of an object store; yield the server's port."""
     content = log.read_bytes()
-    server = web_server(content)
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    with object_store() as store, mock.patch.dict(os.environ, ENVIRONMENT):
+    with odd_server(content) as server, object_store() as store, mock.patch.dict(os.environ, ENVIRONMENT):
         for name in NAMES:
             if len(name.encode("utf-8", "replace")) < 1000 and name.isprintable() and "missing" not in name:
                 store.client.put_object(Bucket="field", Key=name.lstrip("/"), Body=content)
         yield server.server_port
-    server.shutdown()
-    server.server_close()
 
 
-def web_server(content: bytes) -> ThreadingHTTPServer:
-    """Return a server that gives a content, or a part of it, at almost every address; some are redirects and pages."""
+@contextmanager
+def odd_server(content: bytes) -> Iterator[ThreadingHTTPServer]:
+    """Serve a content, or a part of it, at almost every address; some are redirects and pages."""
 
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def do_HEAD(self) -> None:
-            self.answer(body=False)
-
-        def do_GET(self) -> None:
-            self.answer(body=True)
-
+    class Handler(AnsweringHandler):
         def answer(self, *, body: bool) -> None:
             path, first, last, status = urlsplit(self.path).path, 0, len(content), 200
             if "missing" in path or ".json" in path:
@@ -189,14 +178,9 @@ def web_server(content: bytes) -> ThreadingHTTPServer:
                 self.wfile.write(given)
             return None
 
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.daemon_threads = True
-    server.handle_error = lambda *_: None  # type: ignore[method-assign]  # a client that breaks off
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    return server
+    with web_server(Handler) as server:
+        server.handle_error = lambda *_: None  # type: ignore[method-assign]  # a client that breaks off
+        yield server
 
 
 REDIRECTS = {

@@ -16,7 +16,7 @@ hold them as `notes`; `warnings` lists their texts for people. Codes do not chan
 codes. `fleet.csv` has the codes of each log in the column `notes`, separated by `;`.
 
 A command prints the text of a note, not its code. To find a printed warning on this page, search for its words under
-*Found*, or print the codes beside the texts:
+*Found*, or print the codes with the texts:
 
     icrtool fit field.mcap --robot husky-a200 --json | jq -r '.logs[0].run.notes[] | .code + ": " + .text'
 

@@ -334,7 +334,7 @@ def _at_horizon(
     shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
     bins = ranked.histogram(statistics.round_bin_width(shown_m))
     sums = statistics.block_sums(errors, blocks, ranked, p50, p95)
-    del ranked  # frees the memory of a column of the log; the intervals need as much
+    del ranked  # frees a column of the log before the intervals need a column of the same size
     intervals = statistics.error_intervals(errors, blocks, sums, p50, p95, spread)
     _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.of(np.degrees(turned)).summary()
     shares = 100.0 * expected / metres, 100.0 * p95 / metres

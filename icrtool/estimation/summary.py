@@ -151,7 +151,7 @@ def _unusable_reasons(
     excitation: ExcitationDocument, changes_s: Sequence[float], covariance: Floats, rejected: dict[str, float], *,
     inverted: bool,
 ) -> list[Note]:  # fmt: skip
-    """Return why the ICRs must not be used; none where they can be. Parameters are those of `_notes`."""
+    """Return why the ICRs must not be used; none where they can be. Parameters: as of `_notes`."""
     corrects, wheels = config.filter.rules.corrects, measurements.wheels
     of_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
     one_ground = not changes_s and wheels.ground_change_s is None

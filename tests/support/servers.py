@@ -52,20 +52,44 @@ class FileServer:
             time.sleep(0.05)
 
 
+class AnsweringHandler(BaseHTTPRequestHandler):
+    """Answers HEAD and GET by one method, and writes no log."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_HEAD(self) -> None:
+        self.answer(body=False)
+
+    def do_GET(self) -> None:
+        self.answer(body=True)
+
+    def answer(self, *, body: bool) -> None:
+        """Answer a request, without the content where `body` is False."""
+        raise NotImplementedError
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def web_server(handler: type[AnsweringHandler]) -> Iterator[ThreadingHTTPServer]:
+    """Serve on a free port of this machine until the block ends."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
 @contextmanager
 def file_server(folder: Path, **options: object) -> Iterator[FileServer]:
     """Serve a folder until the block ends."""
     serving = FileServer(folder, **options)
 
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def do_HEAD(self) -> None:
-            self.answer(body=False)
-
-        def do_GET(self) -> None:
-            self.answer(body=True)
-
+    class Handler(AnsweringHandler):
         def answer(self, *, body: bool) -> None:
             address = urlsplit(self.path)
             file = serving.folder / unquote(address.path).lstrip("/")
@@ -103,18 +127,9 @@ def file_server(folder: Path, **options: object) -> Iterator[FileServer]:
                     self.wfile.write(piece)
             return None
 
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    serving.url = f"http://127.0.0.1:{server.server_port}"
-    try:
+    with web_server(Handler) as server:
+        serving.url = f"http://127.0.0.1:{server.server_port}"
         yield serving
-    finally:
-        server.shutdown()
-        server.server_close()
 
 
 @dataclass

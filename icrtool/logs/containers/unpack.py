@@ -120,7 +120,7 @@ class _Frames:
 
 
 class _Gzip:
-    """The decoder of a member of a gzip file, with the attributes of those of bz2 and lzma.
+    """The decoder of a member of a gzip file, with the attributes that the decoders of bz2 and lzma have.
 
     `gzip.GzipFile` reads the name in a header byte by byte.
     """

@@ -238,15 +238,10 @@ def test_a_redirect_from_https_to_http_or_a_file_is_refused_and_one_to_a_public_
 def test_a_server_that_redirects_to_another_place_of_its_own_is_read(tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
     log = Path(__file__).parents[3] / "sample_logs" / "wheeled_lawnmower.mcap"
-    server = load_script("fuzz_addresses").web_server(log.read_bytes())
-    try:
-        with contextlib.closing(
-            open_log(UrlPath(f"http://127.0.0.1:{server.server_port}/away-here.mcap"))
-        ) as container:
+    with load_script("fuzz_addresses").odd_server(log.read_bytes()) as server:
+        url = f"http://127.0.0.1:{server.server_port}/away-here.mcap"
+        with contextlib.closing(open_log(UrlPath(url))) as container:
             assert container.channels
-    finally:
-        server.shutdown()
-        server.server_close()
 
 
 def test_a_silent_server_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
