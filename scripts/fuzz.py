@@ -42,6 +42,7 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
 
 import fuzz_addresses  # noqa: E402 - beside this script
+import fuzz_nmea  # noqa: E402
 import fuzz_runs  # noqa: E402
 import fuzz_schemas  # noqa: E402
 import fuzz_structures  # noqa: E402
@@ -203,6 +204,9 @@ MANY_KINDS = 7
 
 SCHEMA_LOGS = 0.1
 """Share of logs that are made of schemas, of long names and many fields, in each serialization that is read."""
+
+NMEA_LOGS = 0.1
+"""Share of logs whose fixes and headings are NMEA sentences."""
 
 VENDOR_LOGS = 0.1
 """Share of logs that hold messages of every type that is read, in place of a drive."""
@@ -381,20 +385,27 @@ def packed(path: Path, kind: str, rng: Random) -> bytes:
     return made[kind](content)
 
 
+def make_special(path: Path, rng: Random) -> tuple[Path, list[str]] | None:
+    """Write a log that is no damaged drive, of schemas, sentences or vendors' messages; None in most cases."""
+    for share, write_log in ((SCHEMA_LOGS, fuzz_schemas.write_log), (NMEA_LOGS, fuzz_nmea.write_log)):
+        if rng.random() < share:
+            return write_log(path, rng)
+    if rng.random() >= VENDOR_LOGS:
+        return None
+    content = bytearray(vendor_log(int(rng.integers(20)), bool(rng.random() < 0.5)))
+    done = [str(rng.choice([doubles, numbers])(content, rng)) for _ in range(int(rng.choice([1, 10, 1000])))]
+    path.write_bytes(content)
+    return path, ["vendor types", *sorted(set(done))]
+
+
 def make_plain(folder: Path, rng: Random) -> tuple[Path, list[str]]:
     """Write a short drive in a random container and damage it; return it with what was done."""
     from dataclasses import asdict
 
     from tests.property.test_fuzz_logs import WHEELS, drive
 
-    if rng.random() < SCHEMA_LOGS:
-        return fuzz_schemas.write_log(folder / "log.mcap", rng)
-    if rng.random() < VENDOR_LOGS:
-        path = folder / "log.mcap"
-        content = bytearray(vendor_log(int(rng.integers(20)), bool(rng.random() < 0.5)))
-        done = [str(rng.choice([doubles, numbers])(content, rng)) for _ in range(int(rng.choice([1, 10, 1000])))]
-        path.write_bytes(content)
-        return path, ["vendor types", *sorted(set(done))]
+    if (special := make_special(folder / "log.mcap", rng)) is not None:
+        return special
     weights = np.array([2.0 if number < MANY_KINDS else 1.0 for number in range(len(KINDS))])
     kind = int(rng.choice(len(KINDS), p=weights / weights.sum()))
     count, wheels = int(rng.choice(COUNTS)), str(rng.choice(WHEELS))

@@ -13,7 +13,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError, LogError
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import DISORDER_NS, TopicTable
 from icrtool.logs.streams.bursts import spread_bursts, spread_positions
@@ -129,11 +129,8 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         far = "one stream has no header stamps, and the header stamps of another are far from log time"
         notes.append(note("log_time_used", f"{far}; log time is used for all streams"))
     notes += clock_notes([(role, one.stamps) for role, one in chosen.items()], name)
-    spread, of_bursts = _spread(position, clock)
+    position, source, of_bursts = _spread(position, source, clock)
     notes += of_bursts
-    if source is not None and (source.topic, source.message_type) == (position.topic, position.message_type):
-        source = replace(source, stamps=spread)
-    position = replace(position, stamps=spread)
     notes += _far_datum(position, config)
     gnss, datum = _fixes(position, config, clock)
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock)
@@ -349,25 +346,40 @@ def _far_datum(source: PositionSource, config: Config) -> list[Note]:
     return [note("datum_far", why)]
 
 
-def _spread(source: PositionSource, clock: Clock) -> tuple[StampedRows, list[Note]]:
-    """Return the stamps of positions, spread where they arrive several at a time or share a stamp, and what was found.
+def _spread(
+    position: PositionSource, heading: HeadingSource | None, clock: Clock
+) -> tuple[PositionSource, HeadingSource | None, list[Note]]:
+    """Return the sources with their stamps spread where positions come several at a time or share a stamp, and a note.
 
-    Rows that are not used keep their stamps.
+    Rows that are not used keep their stamps. Headings of the topic of the positions have the stamps of their positions
+    if both are in the same messages; if they are sentences in messages of their own, they are spread by themselves.
     """
-    rows, stamps = np.flatnonzero(source.usable), source.stamps.on(clock)
-    if source.geodetic is not None:
-        latitude, longitude, _ = np.radians(source.geodetic[rows]).T
+    rows, stamps = np.flatnonzero(position.usable), position.stamps
+    if position.geodetic is not None:
+        latitude, longitude, _ = np.radians(position.geodetic[rows]).T
         place = MEAN_EARTH_RADIUS_M * (latitude + 1j * longitude * np.cos(latitude))
     else:
-        place = np.asarray(source.metric, np.float64)[rows] @ np.array([1.0, 1j])
-    by_header = clock == "header" and source.stamps.header_ns is not None
-    bursts = spread_positions(stamps[rows], place, measured=by_header)
-    if not (text := bursts.sentence("fixes" if source.geodetic is not None else "poses")):
-        return source.stamps, []
-    spread = stamps.copy()
-    spread[rows] = bursts.stamp_ns
-    changed = replace(source.stamps, header_ns=spread) if by_header else replace(source.stamps, log_ns=spread)
-    return changed, [note("fix_bursts", f"{source.topic}: {text}")]
+        place = np.asarray(position.metric, np.float64)[rows] @ np.array([1.0, 1j])
+    by_header = clock == "header" and stamps.header_ns is not None
+    bursts = spread_positions(stamps.on(clock)[rows], place, measured=by_header)
+    if not (text := bursts.sentence("fixes" if position.geodetic is not None else "poses")):
+        return position, heading, []
+    if heading is not None and (heading.topic, heading.message_type) == (position.topic, position.message_type):
+        own, used = bursts, position.usable
+        if not np.array_equal(heading.stamps.on(clock), stamps.on(clock)):
+            own, used = spread_bursts(heading.stamps.on(clock)[heading.usable]), heading.usable
+            own = own.as_shared() if bursts.shared else own
+        heading = replace(heading, stamps=_moved(heading.stamps, used, own.stamp_ns, clock))
+    moved = _moved(stamps, position.usable, bursts.stamp_ns, clock)
+    return replace(position, stamps=moved), heading, [note("fix_bursts", f"{position.topic}: {text}")]
+
+
+def _moved(rows: StampedRows, used: Bools, stamp_ns: Ints, clock: Clock) -> StampedRows:
+    """Return stamps of which those used (n,) are replaced on a clock; the others stay as they are."""
+    moved = rows.on(clock).copy()
+    moved[used] = stamp_ns
+    is_header = clock == "header" and rows.header_ns is not None
+    return replace(rows, header_ns=moved) if is_header else replace(rows, log_ns=moved)
 
 
 def _headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[HeadingSamples, str]:

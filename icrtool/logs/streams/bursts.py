@@ -38,6 +38,11 @@ class Bursts(NamedTuple):
     apart_ns: int
     shared: bool = False
 
+    def as_shared(self) -> Bursts:
+        """Return them with the stamps of a packet as the time of its first sample, not of its last one."""
+        later = self.apart_ns - self.apart_ns // max(self.samples, 1)
+        return self._replace(stamp_ns=self.stamp_ns + later, shared=True)
+
     def sentence(self, of: str) -> str:
         """Return what was found of samples and done, as a sentence; empty without bursts."""
         if not self.samples:
@@ -108,6 +113,5 @@ def spread_positions(stamp_ns: Ints, place: Complexes, *, measured: bool) -> Bur
     if not (within.any() and (~within).any() and step[within].mean() > EVEN_STEP * step[~within].mean()):
         return Bursts(stamp_ns, 0, 0)
     if measured and float((np.diff(np.sort(stamp_ns))[within] == 0).mean()) > EVEN_STEP:
-        later = bursts.apart_ns - bursts.apart_ns // bursts.samples
-        return bursts._replace(stamp_ns=bursts.stamp_ns + later, shared=True)
+        return bursts.as_shared()
     return bursts

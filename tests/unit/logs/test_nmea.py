@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import time
+from pathlib import Path
 
 import numpy as np
 import pynmea2
@@ -12,13 +13,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from icrtool.config import Config
+from icrtool.config import Config, load_config
 from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC, _degrees, parse_sentence
 from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.read_log import read_log
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
+from icrtool.records.tables import RobotLog
+from support.field_logs import ROBOT
+from support.scripts import load_script
 from support.tables import channel_of, collected, read_source
 
 ROUNDING_DEG = 1e-12
+FUZZ = load_script("fuzz_nmea")
 STEP_NS = 100_000_000
 PATIENT = settings(suppress_health_check=[HealthCheck.too_slow])
 """On a busy machine the first drawing takes seconds."""
@@ -223,3 +229,39 @@ def test_headings_of_unicore_are_read_with_their_deviation_and_checked() -> None
     found = read_source("heading", table_of(texts), Config())
     np.testing.assert_allclose(np.degrees(found.yaw_rad), [30.0, 31.0, 32.0, 34.0])
     np.testing.assert_allclose(np.degrees(np.sqrt(found.variance)), 0.31)
+
+
+def read_topic(path: Path, texts: list[bytes], stamps: list[int]) -> RobotLog:
+    """Return the log of 400 wheel samples and a topic of sentences, with a message for each text."""
+    FUZZ.write_sentences(path, texts, stamps, 400, 0)
+    return read_log(path, load_config(sets=ROBOT))
+
+
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_headings_in_messages_of_their_own_have_their_own_stamps(tmp_path: Path, every: int) -> None:
+    """Their number need not be that of the fixes."""
+    stamps, epochs = FUZZ.drive(400)
+    fix_ns, heading_ns = stamps, [one + 30_000_000 for one in stamps[::every]]
+    timed = [(one, epoch[1]) for one, epoch in zip(fix_ns, epochs, strict=True)]
+    timed += [(one, epoch[3]) for one, epoch in zip(heading_ns, epochs[::every], strict=True)]
+    ordered = sorted(timed)
+    log = read_topic(tmp_path / "log.mcap", [sentence(body) for _, body in ordered], [one for one, _ in ordered])
+    assert log.gnss.stamp_ns.tolist() == fix_ns
+    assert log.heading.stamp_ns.tolist() == heading_ns
+
+
+def test_headings_in_bursts_are_spread_as_the_fixes_of_their_topic(tmp_path: Path) -> None:
+    stamps, epochs = FUZZ.drive(400)
+    whole = len(stamps) // 5 * 5
+    packets = [stamps[row // 5 * 5 + 4] + row % 5 * 2_000_000 for row in range(whole)]
+    chosen = [epoch[1::2] if row % 3 else epoch[1:2] for row, epoch in enumerate(epochs[:whole])]
+    texts = [sentence(body) for epoch in chosen for body in epoch]
+    log = read_topic(
+        tmp_path / "log.mcap", texts, [one for one, epoch in zip(packets, chosen, strict=True) for _ in epoch]
+    )
+    assert [one.code for one in log.notes] == ["fix_bursts"]
+    step_ns = stamps[1] - stamps[0]
+    assert np.abs(log.gnss.stamp_ns - stamps[:whole]).max() < 0.2 * step_ns
+    sent = [stamp for row, stamp in enumerate(stamps[:whole]) if row % 3]
+    assert len(log.heading.stamp_ns) == len(sent)
+    assert np.abs(log.heading.stamp_ns - sent).max() < 1.5 * step_ns
