@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import icrtool
+from icrtool import pipeline
 from icrtool.cli import main
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files import remote_place
@@ -61,6 +62,29 @@ def store(server, tmp_path, monkeypatch):
     monkeypatch.setattr(s3fs.S3FileSystem, "retries", 1)
     yield server
     assert not list((tmp_path / "temporary").iterdir())
+
+
+@pytest.fixture(scope="module")
+def fitted_once():
+    """The function that fits a log, which fits each log once for each request; a command still reads its log.
+
+    The results that are uploaded are those of that log; fitting it again would show nothing about the upload.
+    """
+    fitted = {}
+
+    def fit_log(log, config, request, **how):
+        key = repr((log.inputs, config, request))
+        if key not in fitted:
+            fitted[key] = pipeline_fit(log, config, request, **how)
+        return fitted[key]
+
+    pipeline_fit = pipeline.fit_log
+    return fit_log
+
+
+@pytest.fixture(autouse=True)
+def fits_once(fitted_once, monkeypatch):
+    monkeypatch.setattr(pipeline, "fit_log", fitted_once)
 
 
 @pytest.fixture
@@ -319,14 +343,17 @@ def test_of_two_commands_that_write_to_one_address_one_ends_with_an_error(store,
 def test_a_command_that_writes_while_another_uploads_changes_nothing_and_the_run_is_whole(
     store, monkeypatch, capfd, mcap, group
 ):
-    """The other command begins and ends before each group of files of this one."""
+    """The other command begins and ends before each group of files of this one; it states another living process."""
     each, others, calls = remote_place._Store._each, [], []
+    other = f"{writer().partition('-')[0]}-{os.getppid()}-0123abcd"
 
     def between(self, request, files):
         if isinstance(request, functools.partial):
             calls.append(0)
             if len(calls) == group + 1:
-                others.append(fit_apart(mcap))
+                with monkeypatch.context() as patch:
+                    patch.setattr(remote_place, "writer", lambda: other)
+                    others.append(run(patch, capfd, *fit_command(mcap), "--smooth", "-q")[0])
         return each(self, request, files)
 
     monkeypatch.setattr(remote_place._Store, "_each", between)
