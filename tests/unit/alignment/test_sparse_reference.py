@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from dataclasses import replace
@@ -13,7 +14,7 @@ import pytest
 import icrtool
 from icrtool.alignment.align import align
 from icrtool.alignment.sparse_reference import spans_of_measured, with_carried_heading, without_interpolated
-from icrtool.config import load_config
+from icrtool.config import Config, load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.track import Track
 from icrtool.pipeline import fit
@@ -151,13 +152,19 @@ def test_spans_begin_and_end_at_measured_headings() -> None:
 REAL = ("warthog_asphalt", "warthog_grass.bag", "warthog_grass_0718", "warthog_grass_0729", "warthog_grass_0808")
 
 
+@functools.cache
+def recorded(path: Path) -> tuple[RobotLog, Config, tuple[float, float]]:
+    """Return a recorded log, its configuration, and the multiplier by all its poses."""
+    config = icrtool.load_config(robot="warthog")
+    log = replace(icrtool.read_log(path, config), other_references=())
+    return log, config, multiplier_of(fit(log, config))
+
+
 @pytest.mark.parametrize("name", REAL)
 @pytest.mark.parametrize("every_s", EVERY_S)
 @pytest.mark.parametrize("linear", [False, True])
 def test_recorded_poses_may_be_rare(shared_logs: Path, name: str, every_s: float, linear: bool) -> None:
-    config = icrtool.load_config(robot="warthog")
-    log = replace(icrtool.read_log(shared_logs / "real" / name, config), other_references=())
-    full = multiplier_of(fit(log, config))
+    log, config, full = recorded(shared_logs / "real" / name)
     rare = thinned(log, every_s)
     run = fit(interpolated(rare) if linear else rare, config)
     assert run.usable, run.summary["unusable_because"]
@@ -165,15 +172,21 @@ def test_recorded_poses_may_be_rare(shared_logs: Path, name: str, every_s: float
     assert abs(value - full[0]) < 2.0 * math.hypot(std, full[1])
 
 
+@functools.cache
+def simulated(path: Path) -> tuple[RobotLog, Config, tuple[float, float]]:
+    """Return a simulated log with poses, its configuration, and the multiplier by all its poses."""
+    made = json.loads(path.with_name(f"{path.name}.json").read_text())
+    keys = {"track_width_m": "track_width_m", "wheel_radius_m": "radius_m", "encoder_counts_per_rev": "counts_per_rev"}
+    config = icrtool.load_config(sets=[f"robot.{key}={made[own]}" for key, own in keys.items()])
+    log = poses_of(icrtool.read_log(path, config))
+    return log, config, multiplier_of(fit(replace(log, gyro=None, gyros=()), config))
+
+
 @pytest.mark.parametrize("name", ["tracked_curved.bag", "wheeled_lawnmower"])
 @pytest.mark.parametrize("every_s", EVERY_S)
 @pytest.mark.parametrize("linear", [False, True])
 def test_simulated_poses_may_be_rare(shared_logs: Path, name: str, every_s: float, linear: bool) -> None:
-    made = json.loads((shared_logs / "simulated" / f"{name}.json").read_text())
-    keys = {"track_width_m": "track_width_m", "wheel_radius_m": "radius_m", "encoder_counts_per_rev": "counts_per_rev"}
-    config = icrtool.load_config(sets=[f"robot.{key}={made[own]}" for key, own in keys.items()])
-    log = poses_of(icrtool.read_log(shared_logs / "simulated" / name, config))
-    full = multiplier_of(fit(replace(log, gyro=None, gyros=()), config))
+    log, config, full = simulated(shared_logs / "simulated" / name)
     rare = thinned(log, every_s)
     run = fit(interpolated(rare) if linear else rare, config)
     if not run.usable:

@@ -16,6 +16,9 @@ from support.drives import ICRS
 from support.field_logs import RADIUS_M, ROBOT, WIDTH_M, fixes, imus, joint_states, make_drive, write_messages
 
 MULTIPLIER = (ICRS[0] - ICRS[1]) / WIDTH_M
+REPORTED = (2.0, 0.1, 0.3)
+"""Factors of the radius for which the rows of a report are looked at: too large, too small, corrected by the scales of
+the configuration."""
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +68,8 @@ def test_every_row_sees_wheels_that_were_corrected(path: Path, radius: float, se
     assert numbers is not None
     assert numbers.multiplier == pytest.approx(MULTIPLIER, abs=0.02)
     assert (numbers.left_radius, numbers.right_radius) == pytest.approx((1 / radius, 1 / radius), rel=0.01)
+    if radius not in REPORTED:
+        return
     found = dropout_report(run, horizons_m=[10.0])
     for name in ("controller", "recommended", "icr_final"):
         result = found.result(name)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import re
+import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import resources
@@ -272,12 +273,14 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Written]:
                 decoded = decode_mcap(path, Ros1Decoder())
             case "mcap idl":
                 path = write_mcap(path, topics, store, "ros2idl")
-                decoded = decode_mcap(write_mcap(folder / "same", topics, store), Ros2Decoder())
+                decoded = get("mcap cdr").decoded  # of the same messages
+            case "db3 without definitions":
+                path = shutil.copytree(get("db3").path, path)
+                forget_definitions(path)
+                decoded = get("db3").decoded
             case _:
                 path = write_directory(path, topics, store, big_endian="big-endian" in container)
                 decoded = decode_rosbags(path, store)
-        if container == "db3 without definitions":
-            forget_definitions(path)
         # with all columns, also those that candidates were made of
         with mock.patch("icrtool.logs.streams.select.drop_used_columns"):
             return Written(path, survey_log(path), decoded)
@@ -408,6 +411,8 @@ def without(store: Typestore, name: str, dropped: str) -> Typestore:
             inner = detail[0] if int(node) in (ARRAY, SEQUENCE) else (node, detail)
             open_names += [inner[1]] if int(inner[0]) == NAME and inner[1] not in kept else []
     changed.register(kept)
+    # The code for the types in it is that for the whole type.
+    changed.cache |= {of: store.get_msgdef(of) for of in kept if of != name}
     return changed
 
 

@@ -416,10 +416,11 @@ def test_standard_input_gives_the_numbers_of_the_file(tmp_path, temporary, short
 @pytest.mark.parametrize("log", ["-", "endless.mcap.gz"])
 def test_ctrl_c_while_unpacking_leaves_nothing_behind(tmp_path, temporary, log):
     path = tmp_path / "endless.mcap.gz"
-    with gzip.open(path, "wb", 0) as file:
-        file.write(MCAP.read_bytes()[:100_000])
-        for _ in range(200):
-            file.write(bytes(1 << 20))
+    if log != "-":
+        with gzip.open(path, "wb", 0) as file:
+            file.write(MCAP.read_bytes()[:100_000])
+            for _ in range(200):
+                file.write(bytes(1 << 20))
     one = command("info", log, temporary=temporary, stdin=subprocess.PIPE, cwd=tmp_path)
     if log == "-":
         one.stdin.write(MCAP.read_bytes()[:100_000])  # and never an end
@@ -500,12 +501,12 @@ def test_an_archive_of_thousands_of_folders_costs_little_time(tmp_path):
     open_log(path).close()
     assert time.process_time() - begin < 2.0 + path.stat().st_size / 1e6
     with zipfile.ZipFile(tmp_path / "y.zip", "w") as archive:
-        for number in range(20_000):
+        for number in range(5_000):
             archive.writestr(f"folder{number}/a.mcap", b"x")
     begin = time.process_time()
     with pytest.raises(LogError, match="more than 100 folders"):
         open_log(tmp_path / "y.zip")
-    assert time.process_time() - begin < 3.0
+    assert time.process_time() - begin < 0.8
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "no log in it", "a database cut off", "two parts"])
@@ -555,14 +556,16 @@ def test_a_gzip_file_whose_header_has_a_long_name_costs_little_time(tmp_path):
 @pytest.mark.parametrize("count", [1, 7, 300, 1 << 16, 1 << 20])
 def test_members_of_a_gzip_file_come_out_as_python_s_own_module_reads_them(count):
     rng = random.Random(count)
-    parts = [b"", bytes(200_000), rng.randbytes(150_000), b"a" * 65_536, rng.randbytes(3)]
+    size = 200_000 if count >= 300 else 400 * count
+    parts = [b"", bytes(size), rng.randbytes(3 * size // 4), b"a" * min(size, 65_536), rng.randbytes(3)]
     packed = b"".join(gzip.compress(part) for part in parts) + bytes(512) + gzip.compress(b"end") + bytes(9)
     stream, pieces = unpack.DECODERS[b"\x1f\x8b"](io.BytesIO(packed)), []
     while piece := stream.read(count):
         assert len(piece) <= count
         pieces.append(piece)
     assert b"".join(pieces) == gzip.decompress(packed)
-    cut = unpack.DECODERS[b"\x1f\x8b"](io.BytesIO(packed[:100_000]))
+    before = sum(len(gzip.compress(part)) for part in parts[:2])
+    cut = unpack.DECODERS[b"\x1f\x8b"](io.BytesIO(packed[: before + size // 2]))
     with pytest.raises(EOFError):
         list(iter(lambda: cut.read(count), b""))
 

@@ -38,16 +38,15 @@ from icrtool.records.places import UrlPath, place_of, without_secrets
 from support.batches import in_this_process
 from support.servers import SECRET, file_server, object_store
 
-SAMPLES = Path(__file__).parents[3] / "sample_logs"
-MCAP, BAG, DIRECTORY = (
-    SAMPLES / name for name in ("wheeled_lawnmower.mcap", "tracked_curved.bag", "wheeled_figure_eight")
-)
-DB3 = DIRECTORY / "wheeled_figure_eight.db3"
+MCAP, BAG, DIRECTORY, DB3 = "field.mcap", "other.bag", "third", "third/third.db3"
+"""Of the short logs."""
+WHEEL_MESSAGES = 1800
+"""Of each."""
 PICTURE_BYTES = 400_000
-CONFIG = load_config(robot="segway-rmp400")
+CONFIG = load_config(robot="husky-a200")
 ROWS = range(100)
 TOKEN = f"sig={SECRET}"
-ROBOT = ("--robot", "segway-rmp400")
+ROBOT = ("--robot", "husky-a200")
 pytestmark = [
     pytest.mark.skipif(find_spec("fsspec") is None, reason="needs the extra icrtool[cloud]"),
     pytest.mark.skipif(find_spec("aiohttp") is None, reason="needs the extra icrtool[http]"),
@@ -56,17 +55,18 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def store():
-    """A bucket `field` with the sample logs, behind a proxy that counts bytes; credentials as a user sets them."""
+def store(short_logs):
+    """A bucket `field` with the short logs, behind a proxy that counts bytes; credentials as a user sets them."""
     pytest.importorskip("s3fs", reason="needs the extra icrtool[cloud]")
     pytest.importorskip("moto.server", reason="needs moto, of the extra icrtool[dev]")
     with object_store() as proxy:
         for name, file in {
-            "mon/a.mcap": MCAP, "tue/b.bag": BAG,
-            "wed/c/c.db3": DB3, "wed/c/metadata.yaml": DIRECTORY / "metadata.yaml",
+            "mon/a.mcap": short_logs / MCAP, "tue/b.bag": short_logs / BAG,
+            "wed/c/c.db3": short_logs / DB3, "wed/c/metadata.yaml": short_logs / DIRECTORY / "metadata.yaml",
         }.items():  # fmt: skip
             proxy.client.upload_file(str(file), "field", name)
-        proxy.client.put_object(Bucket="field", Key="packed/d.mcap.gz", Body=gzip.compress(MCAP.read_bytes()))
+        packed = gzip.compress((short_logs / MCAP).read_bytes())
+        proxy.client.put_object(Bucket="field", Key="packed/d.mcap.gz", Body=packed)
         proxy.client.put_object(Bucket="field", Key="notes.txt", Body=b"no log")
         yield proxy
 
@@ -97,20 +97,21 @@ def messages(path: Path) -> list[tuple[str, int, bytes]]:
     ("key", "file"),
     [("mon/a.mcap", MCAP), ("tue/b.bag", BAG), ("wed/c/c.db3", DB3), ("wed/c", DIRECTORY), ("packed/d.mcap.gz", MCAP)],
 )
-def test_a_log_in_a_bucket_has_the_messages_of_the_file(fresh, key, file):
-    assert messages(UrlPath(f"s3://field/{key}")) == messages(file)
+def test_a_log_in_a_bucket_has_the_messages_of_the_file(fresh, key, file, short_logs):
+    assert messages(UrlPath(f"s3://field/{key}")) == messages(short_logs / file)
 
 
-@pytest.mark.parametrize("file", [MCAP, BAG, DB3])
+@pytest.mark.parametrize("log", [MCAP, BAG, DB3])
 @pytest.mark.parametrize("ranges", [True, False])
-def test_a_log_on_a_web_server_has_the_messages_of_the_file_with_and_without_ranges(file, ranges):
+def test_a_log_on_a_web_server_has_the_messages_of_the_file_with_and_without_ranges(log, ranges, short_logs):
+    file = short_logs / log
     with file_server(file.parent, ranges=ranges, token=TOKEN) as server:
         url = UrlPath(f"{server.url}/{file.name}?{TOKEN}")
         assert messages(url) == messages(file)
         container = open_log(url)
         (found,) = container.inputs(Event())
         container.close()
-    by_ranges = ranges and file != DB3
+    by_ranges = ranges and log != DB3
     assert found.sha256 == (None if by_ranges else hashlib.sha256(file.read_bytes()).hexdigest())
     assert (found.bytes, found.etag) == (file.stat().st_size, str(file.stat().st_mtime_ns))
     assert TOKEN not in repr(found)
@@ -210,7 +211,7 @@ def test_of_a_bag_directory_of_mcap_files_only_the_bytes_that_are_needed_are_rea
     folder.mkdir()
     names = [f"drive_{number}.mcap" for number in range(3)]
     for name in names:
-        drive(folder / name, size=20_000_000, **LAYOUTS["own chunks"])
+        drive(folder / name, size=12_000_000, **LAYOUTS["own chunks"])
     metadata = f"rosbag2_bagfile_information:\n  relative_file_paths: [{', '.join(names)}]\n"
     (folder / "metadata.yaml").write_text(metadata)
     size = sum(file.stat().st_size for file in folder.iterdir())
@@ -234,8 +235,8 @@ def test_of_a_bag_directory_of_mcap_files_only_the_bytes_that_are_needed_are_rea
         fresh.client.delete_object(Bucket="field", Key=f"large/drive/{name}")
 
 
-def test_a_log_without_an_index_is_fetched_and_read_to_its_end(tmp_path):
-    (tmp_path / "cut.mcap").write_bytes(MCAP.read_bytes()[:-5000])
+def test_a_log_without_an_index_is_fetched_and_read_to_its_end(tmp_path, short_logs):
+    (tmp_path / "cut.mcap").write_bytes((short_logs / MCAP).read_bytes()[:-5000])
     with file_server(tmp_path) as server:
         assert messages(UrlPath(f"{server.url}/cut.mcap")) == messages(tmp_path / "cut.mcap")
 
@@ -262,19 +263,19 @@ def test_a_log_whose_index_is_wrong_about_a_chunk_is_fetched_and_loses_no_messag
         assert messages(UrlPath(f"{server.url}/a.mcap")) == whole
 
 
-def test_about_a_file_that_is_fetched_the_server_is_asked_once(tmp_path, monkeypatch):
-    (tmp_path / "packed.gz").write_bytes(gzip.compress(MCAP.read_bytes()))
+def test_about_a_file_that_is_fetched_the_server_is_asked_once(tmp_path, monkeypatch, short_logs):
+    (tmp_path / "packed.gz").write_bytes(gzip.compress((short_logs / MCAP).read_bytes()))
     made = []
     monkeypatch.setattr(source, "_about", lambda path, about=source._about: made.append(path) or about(path))
     with file_server(tmp_path) as server:
-        assert messages(UrlPath(f"{server.url}/packed.gz")) == messages(MCAP)
+        assert messages(UrlPath(f"{server.url}/packed.gz")) == messages(short_logs / MCAP)
     assert len(made) == 1
 
 
-def test_a_broken_connection_is_made_again(monkeypatch):
+def test_a_broken_connection_is_made_again(monkeypatch, short_logs):
     monkeypatch.setattr(connection, "PAUSES_S", (0.01, 0.01))
-    with file_server(SAMPLES, broken=2) as server:
-        assert messages(UrlPath(f"{server.url}/{MCAP.name}")) == messages(MCAP)
+    with file_server(short_logs, broken=2) as server:
+        assert messages(UrlPath(f"{server.url}/{MCAP}")) == messages(short_logs / MCAP)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -293,17 +294,17 @@ def test_connections_that_break_while_chunks_are_read_are_made_again_or_one_erro
         container.close()
 
 
-def test_a_connection_that_stays_broken_is_one_line_without_secrets(monkeypatch):
+def test_a_connection_that_stays_broken_is_one_line_without_secrets(monkeypatch, short_logs):
     monkeypatch.setattr(connection, "PAUSES_S", (0.01, 0.01))
-    with file_server(SAMPLES, token=TOKEN) as server:
-        container = open_log(UrlPath(f"{server.url}/{MCAP.name}?{TOKEN}"))
+    with file_server(short_logs, token=TOKEN) as server:
+        container = open_log(UrlPath(f"{server.url}/{MCAP}?{TOKEN}"))
         server.broken = 10_000
         with pytest.raises(LogError, match="cannot be read") as caught:
             list(container.blocks(frozenset(one.id for one in container.channels)))
         container.close()
     assert TOKEN not in str(caught.value)
     with pytest.raises(LogError, match="cannot be read"):
-        open_log(UrlPath(f"{server.url}/{MCAP.name}?{TOKEN}"))
+        open_log(UrlPath(f"{server.url}/{MCAP}?{TOKEN}"))
 
 
 @pytest.mark.parametrize("key", ["mon/a.mcap", "tue/b.bag", "wed/c", "packed/d.mcap.gz"])
@@ -333,12 +334,12 @@ def test_a_table_in_a_bucket_is_read_compressed_too(fresh):
     fresh.client.delete_object(Bucket="field", Key="tables/a.csv.gz")
 
 
-def test_a_file_that_is_not_there_or_not_allowed_is_said_so(fresh):
-    with file_server(SAMPLES, token=TOKEN) as server:
+def test_a_file_that_is_not_there_or_not_allowed_is_said_so(fresh, short_logs):
+    with file_server(short_logs, token=TOKEN) as server:
         with pytest.raises(LogError, match="no such file"):
             open_log(UrlPath(f"{server.url}/none.mcap?{TOKEN}"))
         with pytest.raises(LogError, match="may not be read"):
-            open_log(UrlPath(f"{server.url}/{MCAP.name}?sig=wrong"))
+            open_log(UrlPath(f"{server.url}/{MCAP}?sig=wrong"))
     for key in ("none.mcap", "none/"):
         with pytest.raises(LogError, match="no such file"):
             open_log(UrlPath(f"s3://field/{key}"))
@@ -355,21 +356,21 @@ def test_patterns_folders_and_manifests_find_the_logs_of_a_bucket(fresh, tmp_pat
         "tue/b",
     ]
     manifest = tmp_path / "logs.csv"
-    manifest.write_text("log,robot,group\ns3://field/mon/*.mcap,segway-rmp400,grass\n")
+    manifest.write_text("log,robot,group\ns3://field/mon/*.mcap,husky-a200,grass\n")
     (entry,) = read_manifest(manifest)
     assert [str(place) for place in entry.places] == everything[:1]
     with pytest.raises(LogError, match="matches nothing"):
         find_logs_at(UrlPath("s3://field/**/*.ulg"))
 
 
-def test_a_name_with_brackets_is_a_file_before_it_is_a_pattern(fresh):
-    fresh.client.upload_file(str(MCAP), "field", "odd/drive[1].mcap")
-    fresh.client.upload_file(str(MCAP), "field", "odd/drive2.mcap")
+def test_a_name_with_brackets_is_a_file_before_it_is_a_pattern(fresh, short_logs):
+    fresh.client.upload_file(str(short_logs / MCAP), "field", "odd/drive[1].mcap")
+    fresh.client.upload_file(str(short_logs / MCAP), "field", "odd/drive2.mcap")
     assert [one.url for one in find_logs_at(UrlPath("s3://field/odd/drive[1].mcap"))] == [
         "s3://field/odd/drive[1].mcap"
     ]
     assert [one.url for one in find_logs_at(UrlPath("s3://field/odd/drive[2].mcap"))] == ["s3://field/odd/drive2.mcap"]
-    assert messages(UrlPath("s3://field/odd/drive[1].mcap")) == messages(MCAP)
+    assert messages(UrlPath("s3://field/odd/drive[1].mcap")) == messages(short_logs / MCAP)
     for name in ("odd/drive[1].mcap", "odd/drive2.mcap"):
         fresh.client.delete_object(Bucket="field", Key=name)
 
@@ -385,11 +386,11 @@ def run(monkeypatch, capfd, *arguments: object) -> tuple[int, str]:
     return status, "".join(capfd.readouterr())
 
 
-def test_fit_from_an_address_gives_the_run_of_the_file_and_no_secret(tmp_path, monkeypatch, capfd):
+def test_fit_from_an_address_gives_the_run_of_the_file_and_no_secret(tmp_path, monkeypatch, capfd, short_logs):
     monkeypatch.chdir(tmp_path)
-    assert run(monkeypatch, capfd, "fit", MCAP, *ROBOT, "-o", "local", "--plots", "none")[0] == 0
-    with file_server(SAMPLES, token=TOKEN) as server:
-        url = f"{server.url}/{MCAP.name}?{TOKEN}"
+    assert run(monkeypatch, capfd, "fit", short_logs / MCAP, *ROBOT, "-o", "local", "--plots", "none")[0] == 0
+    with file_server(short_logs, token=TOKEN) as server:
+        url = f"{server.url}/{MCAP}?{TOKEN}"
         given = (*ROBOT, "-o", "remote", "--plots", "none", "--no-ladder", "-v")
         for _ in range(2):  # a second time, its own run is replaced
             status, said = run(monkeypatch, capfd, "dropout-report", url, *given)
@@ -402,12 +403,12 @@ def test_fit_from_an_address_gives_the_run_of_the_file_and_no_secret(tmp_path, m
     assert (tmp_path / "local/states.csv").read_bytes() == (tmp_path / "remote/states.csv").read_bytes()
     assert not [file for file in Path("remote").rglob("*") if file.is_file() and SECRET.encode() in file.read_bytes()]
     (found,) = json.loads((tmp_path / "remote/run.json").read_text())["inputs"]
-    assert found["path"] == f"{server.url}/{MCAP.name}"
+    assert found["path"] == f"{server.url}/{MCAP}"
     assert found["sha256"] is None
     assert found["etag"]
 
 
-def test_batch_reads_a_bucket_and_skips_what_is_unchanged(fresh, tmp_path, monkeypatch, capfd):
+def test_batch_reads_a_bucket_and_skips_what_is_unchanged(fresh, tmp_path, monkeypatch, capfd, short_logs):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
     command = ("batch", "s3://field/mon", *ROBOT, "-o", "out", "--plots", "none", "--no-ladder", "-j", "1", "--json")
@@ -415,15 +416,15 @@ def test_batch_reads_a_bucket_and_skips_what_is_unchanged(fresh, tmp_path, monke
     assert status == 0, said
     status, said = run(monkeypatch, capfd, *command)
     assert [one["this_time"] for one in json.loads(said)["logs"]] == ["skipped"]
-    fresh.client.upload_file(str(SAMPLES / "wheeled_lawnmower.mcap"), "field", "mon/a.mcap")
-    fresh.client.put_object(Bucket="field", Key="mon/a.mcap", Body=MCAP.read_bytes() + b"\0")
+    fresh.client.upload_file(str(short_logs / MCAP), "field", "mon/a.mcap")
+    fresh.client.put_object(Bucket="field", Key="mon/a.mcap", Body=(short_logs / MCAP).read_bytes() + b"\0")
     import s3fs
 
     s3fs.S3FileSystem.clear_instance_cache()
     status, said = run(monkeypatch, capfd, *command)
     assert [one["this_time"] for one in json.loads(said)["logs"]] == ["processed"]
     assert SECRET not in said
-    fresh.client.upload_file(str(MCAP), "field", "mon/a.mcap")
+    fresh.client.upload_file(str(short_logs / MCAP), "field", "mon/a.mcap")
 
 
 @pytest.mark.parametrize(
@@ -441,10 +442,10 @@ def test_a_missing_library_is_named_with_the_extra_that_has_it(url, library, ext
     assert said.stderr.strip() == f"Error: {url}: needs {library}; pip install 'icrtool[{extra}]'"
 
 
-def test_a_log_on_disk_loads_no_network_library():
+def test_a_log_on_disk_loads_no_network_library(short_logs):
     script = (
         "import sys\nfrom icrtool.logs.read_log import read_log\nfrom icrtool.config import load_config\n"
-        f"read_log({str(MCAP)!r}, load_config(robot='segway-rmp400'))\n"
+        f"read_log({str(short_logs / MCAP)!r}, load_config(robot='husky-a200'))\n"
         "print([name for name in ('fsspec', 's3fs', 'aiohttp', 'botocore', 'gcsfs', 'adlfs', 'urllib3', 'requests', "
         "'http.client', 'asyncio') if name in sys.modules])"
     )
@@ -502,5 +503,5 @@ def test_inputs_that_were_not_wholly_read_are_not_called_copies():
 
 def test_read_log_takes_an_address(fresh):
     log = read_log("s3://field/mon/a.mcap")
-    assert len(log.wheels.stamp_ns) == 20_000
+    assert len(log.wheels.stamp_ns) == WHEEL_MESSAGES
     assert log.inputs[0].path == "s3://field/mon/a.mcap"
