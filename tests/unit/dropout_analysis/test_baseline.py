@@ -247,12 +247,15 @@ def test_a_new_recording_is_compared_with_the_mean_of_the_robots_drives(report: 
 
 
 def test_the_interval_of_pooled_drives_holds_the_next_drive(report: DropoutReport) -> None:
-    """Drives drawn with the spread that is known of other robots: 19 of 20 next drives are within the interval."""
+    """Drives drawn with the spread that is known of other robots: 19 of 20 next drives are within the interval.
+
+    Of 100 draws an interval that held 8 of 10 next drives fails with a probability of 0.97.
+    """
     rng = np.random.default_rng(5)
     gate = parse_gate("no_slip.expected@2m <= baseline")
     result = report.result("no_slip")
     value, half = result.column("expected_error_m")[1], []
-    held, draws, spread = 0, 200, row_of("no_slip").spread.between
+    held, draws, spread = 0, 100, row_of("no_slip").spread.between
     for _ in range(draws):
         # The next drive is the report itself, so the others are drawn about a mean that it was drawn about.
         mean = math.exp(rng.normal(0.0, spread))

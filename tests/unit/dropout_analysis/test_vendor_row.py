@@ -98,7 +98,9 @@ def test_without_factor_or_width_the_row_is_left_out(factor: float | None, width
     run = fitted(factor, width)
     assert vendor_icrs(run.document) is None
     assert why in why_no_vendor(run.document)
-    stated = "vendor is left out: robot.track_width_m is not known" in format_dropout(dropout_report(run))
+    stated = "vendor is left out: robot.track_width_m is not known" in format_dropout(
+        dropout_report(run, horizons_m=[5.0], ladder=False)
+    )
     assert stated == (factor is not None)
 
 

@@ -33,8 +33,13 @@ def clean() -> RobotLog:
 
 
 @pytest.fixture(scope="module")
-def expected(clean: RobotLog) -> np.ndarray:
-    return icrs(fit(clean, CONFIG))
+def clean_run(clean: RobotLog) -> Run:
+    return fit(clean, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def expected(clean_run: Run) -> np.ndarray:
+    return icrs(clean_run)
 
 
 def icrs(run: Run) -> np.ndarray:
@@ -147,10 +152,8 @@ def late_heading(log: RobotLog) -> RobotLog:
 @pytest.mark.parametrize(
     ("spoil", "offset_deg"),
     [
-        (turned(12.0), 12.0),
         (turned(-35.0), -35.0),
         (other_convention, -90.0),
-        (outliers(0.01), 0.0),
         (outliers(0.05), 0.0),
         (lost, 0.0),
         (parked, 0.0),
@@ -161,7 +164,7 @@ def late_heading(log: RobotLog) -> RobotLog:
         (late_fixes, 0.0),
         (late_heading, 0.0),
     ],
-    ids=["h+12", "h-35", "NED", "1 %", "5 %", "lost", "parked", "held", "swapped", "back", "twice", "fixes", "heading"],
+    ids=["h-35", "NED", "5 %", "lost", "parked", "held", "swapped", "back", "twice", "fixes", "heading"],
 )
 def test_trouble_leaves_the_icrs_of_the_clean_log(
     spoil: Spoil, offset_deg: float, clean: RobotLog, expected: np.ndarray
@@ -173,7 +176,7 @@ def test_trouble_leaves_the_icrs_of_the_clean_log(
 
 
 def test_an_antenna_off_centre_moves_the_icrs_by_its_place_until_it_is_told(
-    clean: RobotLog, expected: np.ndarray
+    clean: RobotLog, clean_run: Run, expected: np.ndarray
 ) -> None:
     """Position tells x_icr minus forward and the middle of the ICRs minus right, never either by itself."""
     forward, right = ANTENNA_M
@@ -186,7 +189,7 @@ def test_an_antenna_off_centre_moves_the_icrs_by_its_place_until_it_is_told(
     run = fit(spoilt, CONFIG)
     assert icrs(run) - expected == pytest.approx([-right, -right, -forward], abs=0.01)
     assert [one for one in run.warnings if "both ICRs lie 0.10 m to the right of the position sensor" in one]
-    assert not [one for one in fit(clean, CONFIG).warnings if "both ICRs" in one]
+    assert not [one for one in clean_run.warnings if "both ICRs" in one]
     ahead = with_fixes(
         clean, clean.gnss.north_m + 2 * forward * np.cos(psi), clean.gnss.east_m + 2 * forward * np.sin(psi)
     )

@@ -22,16 +22,15 @@ from icrtool.output.run_directory import events_csv, log_of
 from icrtool.output.tables.run import format_run
 from support.edits import edited
 
-LOG = Path(__file__).parents[3] / "sample_logs" / "tracked_curved.bag"
 LONGEST_LINE = 1000
 LONGEST_S = 5.0
 
 
 @pytest.fixture(scope="module")
-def run_place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = icrtool.load_config(sets=["robot.track_width_m=0.52"])
+def run_place(short_logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = icrtool.load_config(robot="husky-a200")
     place = tmp_path_factory.mktemp("edited") / "run"
-    icrtool.fit(icrtool.read_log(LOG, config), config).write(place, plots=())
+    icrtool.fit(icrtool.read_log(short_logs / "field.mcap", config), config).write(place, plots=())
     return place
 
 

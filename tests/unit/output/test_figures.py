@@ -44,11 +44,17 @@ CELL = 1 / 700
 """Two points closer than this part of the view are one dot."""
 
 
+DRAWN: dict[tuple[str, int], tuple[Figure, Run]] = {}
+
+
 def drawn(name: str, run: Run) -> Figure:
-    figure = FIGURES[name].draw(run)
-    with style():
-        figure.canvas.draw()
-    return figure
+    """Return a figure of a run with its texts laid out, drawn once; no test changes it."""
+    if (name, id(run)) not in DRAWN:
+        figure = FIGURES[name].draw(run)
+        with style():
+            figure.draw_without_rendering()
+        DRAWN[name, id(run)] = figure, run  # a run that is kept keeps its id
+    return DRAWN[name, id(run)][0]
 
 
 def legend_texts(figure: Figure) -> list[str]:

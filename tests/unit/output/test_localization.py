@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 
@@ -78,6 +79,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drive, Run]:
     return drive, field_run(tmp_path_factory.mktemp("field"), drive)
 
 
+@functools.cache
 def exported(run: Run) -> tuple[Calibration, Localization, str]:
     calibration = calibrate(run)
     numbers = localization(calibration, run)
@@ -183,7 +185,8 @@ def test_what_the_log_does_not_show_is_left_out_and_named(tmp_path: Path, field:
     assert "Left out" in text
     for reason in ("NED", "place of the antenna: not in the log; positions show antenna forward - x ICR"):
         assert reason in words
-    of_calibration = format_localization(calibrate(field[1]), localization(calibrate(field[1])))
+    calibration, _, _ = exported(field[1])
+    of_calibration = format_localization(calibration, localization(calibration))
     ekf = YAML(typ="safe").load(of_calibration)["ekf_filter_node"]["ros__parameters"]
     assert "process_noise_covariance" not in ekf
     assert "process_noise_covariance: a property of one drive" in of_calibration

@@ -16,6 +16,7 @@ import icrtool
 from icrtool.errors import OutputError, RunError
 from icrtool.output import figure_catalogue as catalogue
 from icrtool.output.dropout_directory import write_report
+from icrtool.output.figures import style as figure_style
 from icrtool.output.files import run_columns
 from icrtool.output.files.formats import SOURCES_FILE, file_b2sum, json_bytes, read_sums
 from icrtool.output.run_directory import check_target, open_run, write_run
@@ -29,10 +30,17 @@ def written(tmp_path: Path, run: Run) -> Path:
     return tmp_path / "barn"
 
 
+@pytest.fixture
+def no_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw figures, but write files without pixels: for tests of the names of files."""
+    monkeypatch.setattr(figure_style, "picture_bytes", lambda figure, form: form.encode())
+
+
 def names_in(directory: Path) -> list[str]:
     return sorted(str(path.relative_to(directory)) for path in directory.rglob("[!.]*") if path.is_file())
 
 
+@pytest.mark.usefixtures("no_pixels")
 def test_a_run_directory_holds_what_the_contract_says(tmp_path: Path, run: Run) -> None:
     write_run(run, tmp_path / "runs" / "barn", plots=("png", "svg"))
     figures = ("trajectory", "icr_estimates", "gnss_difference")
@@ -109,6 +117,7 @@ def test_a_list_of_sums_of_60_megabytes_is_refused_unread(tmp_path: Path) -> Non
     assert peak < 8 << 20
 
 
+@pytest.mark.usefixtures("no_pixels")
 def test_the_list_of_a_run_names_its_report_too_and_is_true_at_every_moment(written: Path, run: Run) -> None:
     files = set(names_in(written)) - {"B2SUMS"}
     assert listed(written) == files
@@ -154,6 +163,7 @@ def test_an_old_run_is_replaced_with_its_dropout_analysis(written: Path, run: Ru
     assert [path.name for path in written.parent.iterdir()] == ["barn"]
 
 
+@pytest.mark.usefixtures("no_pixels")
 def test_a_run_replaced_from_inside_says_only_what_the_new_one_does_not_have(
     tmp_path: Path, run: Run, monkeypatch
 ) -> None:
@@ -208,6 +218,7 @@ def test_a_damaged_run_is_replaced_by_that_of_the_log_in_the_same_place_alone(wr
     check_target(written, other, overwrite=True)
 
 
+@pytest.mark.usefixtures("no_pixels")
 def test_every_file_that_icrtool_writes_is_known_as_its_own(tmp_path: Path, run: Run) -> None:
     report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0, 10.0, 15.0, 20.0], outage_s=(4.0,), ladder=True)
     write_run(run, tmp_path / "run", plots=("png", "svg", "pdf"), figures="all")
