@@ -8,10 +8,13 @@ from __future__ import annotations
 import ast
 import sys
 from dataclasses import dataclass
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+
+from support.sources import statements_in, tree_of
 
 PACKAGE = Path(__file__).resolve().parents[1] / "icrtool"
 
@@ -65,8 +68,11 @@ class Import:
     line: int
     at_start: bool
     """Carried out when the module is imported: neither inside a function nor for types only."""
+    names: tuple[str, ...] = ()
+    """What is imported from the module, each with the module's name before it."""
 
 
+@cache
 def imports_of(source: str, package: str) -> list[Import]:
     """List the imports of a module that lies in `package`, relative ones made absolute."""
     found: list[Import] = []
@@ -78,18 +84,19 @@ def imports_of(source: str, package: str) -> list[Import]:
             parents = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
             base = ".".join([*parents, *([node.module] if node.module else [])])
             names = [f"{base}.{name.name}" for name in node.names] if base == "icrtool" else [base]
-            found.extend(Import(module, node.lineno, at_start) for module in names)
+            imported = tuple(f"{node.module}.{name.name}" for name in node.names if node.module)
+            found.extend(Import(module, node.lineno, at_start, imported) for module in names)
         elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
             for child in node.body:
                 visit(child, at_start=False)
             for child in node.orelse:
                 visit(child, at_start=at_start)
         else:
-            later = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
-            for child in ast.iter_child_nodes(node):
+            later = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+            for child in statements_in(node):
                 visit(child, at_start=at_start and not later)
 
-    visit(ast.parse(source), at_start=True)
+    visit(tree_of(source), at_start=True)
     return found
 
 
@@ -103,7 +110,7 @@ def breaches(path: Path, source: str) -> list[str]:
             f"icrtool/{path}: {lines} lines are more than {LONGEST_MODULE_LINES}; split it where its subject splits"
         )
     if path.as_posix() not in IMPORT_BY_TEXT:
-        calls = [node.func for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
+        calls = [node.func for node in ast.walk(tree_of(source)) if isinstance(node, ast.Call)]
         names = [getattr(call, "attr", getattr(call, "id", "")) for call in calls]
         found += [f"icrtool/{path}: {name} imports what no test sees" for name in names if name in IMPORTING_CALLS]
     for one in imports_of(source, ".".join(["icrtool", *path.parts[:-1]])):
@@ -153,14 +160,8 @@ def circle_among(modules: dict[str, str]) -> list[str]:
     graph: dict[str, set[str]] = {}
     for name, source in modules.items():
         package = name if f"{name}.__init__" in modules else name.rpartition(".")[0]
-        targets = {one.module for one in imports_of(source, package)}
         # `from icrtool.a import b` may name the module b
-        targets |= {
-            f"{node.module}.{alias.name}"
-            for node in ast.walk(ast.parse(source))
-            if isinstance(node, ast.ImportFrom) and node.module
-            for alias in node.names
-        }
+        targets = {target for one in imports_of(source, package) for target in (one.module, *one.names)}
         file = f"{name.removeprefix('icrtool.').replace('.', '/')}.py"
         graph[name] = {
             target
@@ -182,7 +183,7 @@ def defined_names(source: str) -> tuple[list[str], list[str]]:
     """Return the upper-case constants and the public functions that a module defines at its top level."""
     constants: list[str] = []
     functions: list[str] = []
-    todo: list[ast.stmt] = list(ast.parse(source).body)
+    todo: list[ast.stmt] = list(tree_of(source).body)
     while todo:
         node = todo.pop()
         if isinstance(node, ast.If | ast.Try):
@@ -215,7 +216,12 @@ def names_with_two_meanings(modules: dict[str, str]) -> list[str]:
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
 
 
-@pytest.mark.parametrize("module", MODULES, ids=str)
+@pytest.fixture(scope="module", params=MODULES, ids=str)
+def module(request: pytest.FixtureRequest) -> Path:
+    """Each module in turn: pytest runs the tests of one after the other, so that it is parsed once."""
+    return request.param
+
+
 def test_module_keeps_to_its_layer(module: Path) -> None:
     assert not (found := breaches(module, (PACKAGE / module).read_text(encoding="utf-8"))), "\n".join(found)
 
@@ -271,7 +277,7 @@ def presets_compared(source: str) -> list[int]:
     """Return the lines of comparisons of a preset with its name: what presets differ in is a field of their record."""
     return [
         node.lineno
-        for node in ast.walk(ast.parse(source))
+        for node in ast.walk(tree_of(source))
         if isinstance(node, ast.Compare)
         and isinstance(node.comparators[0], ast.Constant)
         and isinstance(node.comparators[0].value, str)
@@ -279,7 +285,6 @@ def presets_compared(source: str) -> list[int]:
     ]
 
 
-@pytest.mark.parametrize("module", MODULES, ids=str)
 def test_no_module_asks_for_the_name_of_the_preset(module: Path) -> None:
     assert presets_compared((PACKAGE / module).read_text(encoding="utf-8")) == []
 

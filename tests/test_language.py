@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import re
 import tokenize
@@ -79,11 +80,14 @@ SHORT_IN_NAMES = ("course",)
 """What prose writes in full (course over ground), a name may shorten (``CourseComparison``)."""
 
 
+@functools.cache
 def found_in_text(text: str) -> list[str]:
     """List the words not to use in a text, each with what to use instead."""
     for key in PUBLISHED:
         text = text.replace(key, "")
     text = re.sub(r"\s+", " ", text.replace("_", " "))
+    if not PATTERN.search(text):
+        return []
     rest = INSTEAD.sub(lambda hit: " " * len(hit.group()), text)
     return [f"{hit.group()}: write {WORDS[hit.group().lower()]}" for hit in PATTERN.finditer(rest)]
 
