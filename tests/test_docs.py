@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import functools
 import inspect
 import itertools
 import math
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -94,11 +94,11 @@ def test_the_public_names_of_a_page_exist(page: str) -> None:
         assert hasattr(icrtool, name), name
 
 
-def functions_in(path: Path) -> Iterator[str]:
-    """List the functions of a module and the methods of its classes."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.FunctionDef):
-            yield node.name
+@functools.cache
+def functions_in(path: Path) -> set[str]:
+    """Return the names of the functions of a module and of the methods of its classes."""
+    nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    return {node.name for node in nodes if isinstance(node, ast.FunctionDef)}
 
 
 @pytest.mark.parametrize(("folder", "column"), [("icrtool", -2), ("tests", -1)])
@@ -168,11 +168,12 @@ def test_a_command_that_a_page_shows_has_these_arguments(
 
 @pytest.fixture(scope="module")
 def readme_session() -> dict[str, Any]:
-    """Return what the README's Python block leaves behind."""
+    """Return what the README's Python blocks leave behind, run in order, and the report on the run."""
     names: dict[str, Any] = {}
     with contextlib.chdir(ROOT):
-        exec(README.split("```python\n")[1].split("```")[0], names)
-    return names
+        exec("".join(re.findall(r"```python\n(.*?)```", README, re.DOTALL)), names)
+    assert names["report"].result("calibration") is not None
+    return names | {"whole_report": icrtool.dropout_report(names["run"])}
 
 
 def readme_table(first_cell: str) -> list[list[str]]:
@@ -183,7 +184,7 @@ def readme_table(first_cell: str) -> list[list[str]]:
 
 
 def test_the_readmes_errors_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
-    summary = icrtool.dropout_report(readme_session["run"]).summary.set_index(["model", "horizon_m"])
+    summary = readme_session["whole_report"].summary.set_index(["model", "horizon_m"])
     rows = readme_table("row")
     assert len(rows) == 8
     for row in rows:
@@ -203,7 +204,7 @@ def test_the_readmes_icrs_are_those_of_the_sample_log(readme_session: dict[str, 
 
 
 def test_the_readmes_distances_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
-    by_model = {one.model: one for one in icrtool.dropout_report(readme_session["run"]).document.budgets}
+    by_model = {one.model: one for one in readme_session["whole_report"].document.budgets}
     rows = readme_table("within 0.5 m (95 %)")
     assert len(rows) == 4
     for row in rows:

@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from icrtool.cli.commands import icrtool as command_line
+from support.pictures import blank_pictures
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -33,6 +34,11 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", SESSIONS)
 def test_the_lines_of_a_page_run_in_order(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with blank_pictures():
+        run_lines(page, tmp_path, monkeypatch)
+
+
+def run_lines(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     mpl.use("agg")
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
