@@ -1,7 +1,8 @@
 """Print the pins that icrtool needs to be built and used, with hashes: pinned_requirements.py [EXTRA...].
 
-With ``--only PACKAGE...`` it is what these packages need. pip finds out which packages that is on this system; it
-takes hashes only for a whole list. With ``--rest FILE`` it is what FILE pins and constraints.txt does not.
+Without extras that is constraints.txt. Of extras, pip finds out which packages they need on this system; it takes
+hashes only for a whole list. With ``--only PACKAGE...`` it is what these packages need, with ``--rest FILE`` what FILE
+pins and constraints.txt does not.
 """
 
 from __future__ import annotations
@@ -50,6 +51,9 @@ def main() -> None:
     """Print a line for each package, with its hashes."""
     words = sys.argv[1:]
     of_use, of_development = ((ROOT / f"constraints{part}.txt").read_text(encoding="utf-8") for part in ("", "-dev"))
+    if not words:
+        print(of_use, end="")
+        return
     if words[:1] == ["--rest"]:
         found = by_name(Path(words[1]).read_text(encoding="utf-8"))
         names = set(found) - set(by_name(of_use))
