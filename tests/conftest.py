@@ -19,9 +19,12 @@ settings.load_profile("untimed")
 
 @pytest.fixture(scope="session", autouse=True)
 def interrupts_arrive() -> None:
-    """A shell starts what runs in the background with SIGINT ignored; the processes of the tests would inherit that."""
+    """A shell starts what runs in the background with SIGINT ignored, nohup with SIGHUP: processes inherit that."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    hang_up = getattr(signal, "SIGHUP", None)
+    if hang_up is not None and signal.getsignal(hang_up) is signal.SIG_IGN:
+        signal.signal(hang_up, signal.SIG_DFL)
 
 
 SHORT_DRIVE = (
@@ -31,17 +34,28 @@ SHORT_DRIVE = (
 """Options of `icrtool simulate`: all rows of a report, and a tenth of the messages of a sample log."""
 
 
+def simulate_short_drive(log: Path, robot: str, seed: int) -> Path:
+    from icrtool.cli.simulate import simulate_command
+
+    words = ("-o", str(log), "--robot", robot, "--seed", str(seed), "-q", *SHORT_DRIVE)
+    done = CliRunner().invoke(simulate_command, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return log
+
+
 @pytest.fixture(scope="session")
 def short_logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with short drives of a husky-a200: field.mcap, other.bag and the directory third with third.db3."""
-    from icrtool.cli.simulate import simulate_command
-
     folder = tmp_path_factory.mktemp("short_logs")
     for seed, log in enumerate(("field.mcap", "other.bag", "third"), start=1):
-        words = ("-o", str(folder / log), "--robot", "husky-a200", "--seed", str(seed), "-q", *SHORT_DRIVE)
-        done = CliRunner().invoke(simulate_command, words, catch_exceptions=False)
-        assert done.exit_code == 0, done.output
+        simulate_short_drive(folder / log, "husky-a200", seed)
     return folder
+
+
+@pytest.fixture(scope="session")
+def short_segway_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short drive of a segway-rmp400, which has the wheels of the sample log."""
+    return simulate_short_drive(tmp_path_factory.mktemp("segway") / "drive.mcap", "segway-rmp400", 1)
 
 
 @pytest.fixture(scope="session")

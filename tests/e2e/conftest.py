@@ -9,6 +9,7 @@ import pytest
 
 from icrtool.cli import main
 from support.batches import in_this_process
+from support.pictures import blank_pictures
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -16,6 +17,13 @@ def batches_in_this_process():
     """Of the scope of a module: files of other folders, which the same process tests next, test the real processes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
+        yield
+
+
+@pytest.fixture
+def without_drawing():
+    """Pictures are blank in a test that reads numbers and files."""
+    with blank_pictures():
         yield
 
 

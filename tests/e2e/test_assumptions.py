@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
-EIGHT, MOWER = SAMPLES / "wheeled_figure_eight", SAMPLES / "wheeled_lawnmower.mcap"
+MOWER = SAMPLES / "wheeled_lawnmower.mcap"
 ROBOT = ("--robot", "segway-rmp400")
 QUIET = ("--plots", "none")
 
@@ -19,12 +19,15 @@ def separation(run: Path) -> float:
 
 
 def test_a_body_twist_is_undone_with_the_width_it_was_made_with(icrtool, tmp_path: Path) -> None:
-    _, _, said = icrtool("fit", EIGHT, *ROBOT, *QUIET, "-o", tmp_path / "right")
+    drive = ("--path", "figure-eight", "--wheel-messages", "twist_stamped", "--duration", "90", "--wheel-rate", "20")
+    assert icrtool("simulate", "-o", "eight.mcap", *ROBOT, *drive, "-q")[0] == 0
+    fit = ("fit", "eight.mcap", *ROBOT, *QUIET)
+    _, _, said = icrtool(*fit, "-o", tmp_path / "right")
     assert "0.61 m (robot.track_width_m)" in said
-    _, _, said = icrtool("fit", EIGHT, *ROBOT, *QUIET, "--set", "robot.track_width_m=0.4", "-o", tmp_path / "wrong")
+    _, _, said = icrtool(*fit, "--set", "robot.track_width_m=0.4", "-o", tmp_path / "wrong")
     assert "with 0.4 m" in said
     told = ("--set", "robot.track_width_m=0.4", "--set", "wheels.twist_width_m=0.61")
-    _, _, said = icrtool("fit", EIGHT, *ROBOT, *QUIET, *told, "-o", tmp_path / "told")
+    _, _, said = icrtool(*fit, *told, "-o", tmp_path / "told")
     assert "twist" not in said
     assert separation(tmp_path / "told") == pytest.approx(separation(tmp_path / "right"), abs=0.02)
     assert separation(tmp_path / "wrong") < 0.8 * separation(tmp_path / "right")
@@ -42,12 +45,13 @@ def test_centimetres_are_refused(icrtool, setting: str) -> None:
     assert said.startswith(f"Error: robot.{setting.partition('=')[0]}: expected a number ≥ 0.0")
 
 
-def test_a_warm_start_from_another_robot_is_said(icrtool, tmp_path: Path) -> None:
-    icrtool("fit", MOWER, *ROBOT, *QUIET, "-o", tmp_path / "first")
-    again = ("fit", MOWER, *ROBOT, *QUIET, "--warm-start", tmp_path / "first")
+def test_a_warm_start_from_another_robot_is_said(icrtool, short_logs: Path, tmp_path: Path) -> None:
+    fit = ("fit", short_logs / "field.mcap", "--robot", "husky-a200", *QUIET)
+    icrtool(*fit, "-o", tmp_path / "first")
+    again = (*fit, "--warm-start", tmp_path / "first")
     _, _, said = icrtool(*again, "-o", tmp_path / "same")
     assert "track width" not in said
     _, _, said = icrtool(*again, "--set", "robot.track_width_m=0.8", "-o", tmp_path / "other")
-    assert "made with a track width of 0.61 m, not 0.8 m" in said
+    assert "made with a track width of 0.555 m, not 0.8 m" in said
     _, _, said = icrtool(*again, "--set", "robot.track_width_m=0.8", "-o", tmp_path / "first", "--overwrite")
-    assert "made with a track width of 0.61 m, not 0.8 m" in said
+    assert "made with a track width of 0.555 m, not 0.8 m" in said

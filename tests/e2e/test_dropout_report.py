@@ -23,6 +23,7 @@ RUN = Path("icrtool-runs") / LOG
 ROBOT = ("--robot", "husky-a200")
 PICTURES = {"summary", "histogram", "worst", "error_map"}
 NO_PLOTS = ("--plots", "none")
+LEAN = ("--no-page", "--no-ladder")
 EASY, HARD = "icr.p95@10m <= 100", "icr.p95@10m <= 0.001"
 
 
@@ -106,11 +107,12 @@ def test_all_files_say_the_same(fitted: Path) -> None:
     assert "limit is not met" in (fitted / "pr.md").read_text(encoding="utf-8")
 
 
-def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(folder: Path) -> None:
+@pytest.mark.usefixtures("without_drawing")
+def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(folder: Path, report_here) -> None:
     shutil.rmtree(folder / LOG)
     before = {name: (folder / RUN / name).read_bytes() for name in ("states.csv", "run.json")}
-    done = report(folder, "--horizons", "2,10", "--plots", "none", "--gate", EASY)
-    assert done.returncode == 0, done.stderr
+    status, out, err = report_here(folder, "--horizons", "2,10", "--gate", EASY)
+    assert (status, err) == (0, "")
     assert {name: (folder / RUN / name).read_bytes() for name in before} == before
     assert files_in(folder / RUN / "dropout") == {
         "summary.csv",
@@ -120,16 +122,14 @@ def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(fold
     }
     assert pd.read_csv(folder / RUN / "dropout" / "summary.csv").horizon_m.unique().tolist() == [2.0, 10.0]
     full = pd.read_csv(folder / RUN / "dropout" / "summary.csv").set_index(["model", "horizon_m"])
-    assert done.stderr == ""
-    assert str(RUN / "report.html") in done.stdout
+    assert str(RUN / "report.html") in out
     assert full.trials.gt(0).all()
 
 
-def test_forced_outages_on_a_stored_run_need_no_log_and_give_the_same(folder: Path) -> None:
+def test_forced_outages_on_a_stored_run_need_no_log_and_give_the_same(folder: Path, report_here) -> None:
     stored = json.loads((folder / RUN / "dropout" / "report.json").read_bytes())["outages"]
     shutil.rmtree(folder / LOG)
-    done = report(folder, RUN, "--outage", 10, "--plots", "none", "-q")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert report_here(folder, RUN, "--outage", 10, *LEAN, "-q") == (0, "", "")
     assert json.loads((folder / RUN / "dropout" / "report.json").read_bytes())["outages"] == stored
     assert stored
 
@@ -157,7 +157,7 @@ def test_an_edited_run_and_one_of_another_schema_are_refused(
 
 def test_several_are_reported_on_in_turn_and_one_that_fails_does_not_stop_the_others(folder: Path, report_here) -> None:
     (folder / RUN / "dropout" / "plots" / "summary.png").unlink()
-    status, out, err = report_here(folder, "no.bag", RUN, "--gate", HARD, "--junit", "g.xml", "--horizons", 10)
+    status, out, err = report_here(folder, "no.bag", RUN, "--gate", HARD, "--junit", "g.xml", "--horizons", 10, *LEAN)
     assert status == 3, "a gate failed, whatever became of other logs"
     assert "1 of 2" in err
     assert f"FAIL  {HARD}" in out
@@ -200,7 +200,7 @@ def test_requests_that_cannot_be_met_leave_the_old_report(
     fitted: Path, report_here, arguments: tuple[str, ...], status: int, why: str
 ) -> None:
     before = {name: (fitted / RUN / name).stat().st_mtime_ns for name in files_in(fitted / RUN)}
-    found, out, err = report_here(fitted, RUN, *arguments)
+    found, out, err = report_here(fitted, RUN, *LEAN, *arguments)
     assert (found, out) == (status, ""), err
     assert why in err
     assert {name: (fitted / RUN / name).stat().st_mtime_ns for name in files_in(fitted / RUN)} == before
@@ -210,7 +210,7 @@ def test_the_smoother_may_be_the_reference(folder: Path, report_here) -> None:
     status, _, err = report_here(folder, RUN, "--reference", "smoothed")
     assert status == 1
     assert "it has no smoothed states; run icrtool fit --smooth" in err
-    status, out, _ = report_here(folder, LOG, *ROBOT, "--reference", "smoothed", "--no-ladder", "-v")
+    status, out, _ = report_here(folder, LOG, *ROBOT, "--reference", "smoothed", *LEAN, "-v")
     assert status == 0
     assert "compared with the smoothed trajectory" in " ".join(out.split())
     assert "held out in turn" not in out
@@ -237,7 +237,7 @@ def test_the_ladder_holds_the_rows_of_the_summary(fitted: Path) -> None:
 def test_a_finished_run_has_the_ladder_of_its_log(folder: Path, report_here) -> None:
     file = folder / RUN / "dropout" / "summary.csv"
     of_log = pd.read_csv(file)
-    status, _, err = report_here(folder, RUN)
+    status, _, err = report_here(folder, RUN, "--no-page")
     assert (status, err) == (0, "")
     # a gate of the first report adds a distance
     pd.testing.assert_frame_equal(of_log[of_log.horizon_m != 7.5].reset_index(drop=True), pd.read_csv(file))
@@ -250,7 +250,7 @@ def test_a_finished_run_has_the_ladder_of_its_log(folder: Path, report_here) -> 
 def test_a_standstill_counts_once_unless_every_start_is_asked_for(folder: Path, report_here) -> None:
     documents = {}
     for starts in ("moving", "all"):
-        status, _, err = report_here(folder, RUN, "--starts", starts, "--horizons", "1,5,1e6", "--no-ladder")
+        status, _, err = report_here(folder, RUN, "--starts", starts, "--horizons", "1,5,1e6", *LEAN)
         assert (status, err) == (0, "")
         documents[starts] = json.loads((folder / RUN / "dropout" / "report.json").read_text(encoding="utf-8"))
     moving, every = (documents[starts]["trials"][0] for starts in ("moving", "all"))

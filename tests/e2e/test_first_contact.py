@@ -112,6 +112,7 @@ def heading_of(value: float) -> float:
     return value + 1.0
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_info_gives_date_extent_verdict_and_a_next_command_that_works(icrtool) -> None:
     status, out, _ = icrtool("info", MOWER, "--robot", "segway-rmp400")
     assert status == 0

@@ -10,20 +10,18 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
 SCALES = ("--set", "wheels.left_scale=1", "--set", "wheels.right_scale=1")
 WRONG = ("--robot", "husky-a200", *SCALES, "--plots", "none")
-"""The robot of the sample log has wheels of 0.27 m, this one of 0.165 m; a scale that is set is not corrected."""
+"""The robot of the log has wheels of 0.27 m, this one of 0.165 m; a scale that is set is not corrected."""
 
 
 @pytest.fixture(scope="module")
-def printed(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], list[str], list[str]]:
+def printed(tmp_path_factory: pytest.TempPathFactory, short_segway_log: Path) -> tuple[list[str], list[str], list[str]]:
     """What is printed of a run with a wrong robot, both streams in one, without and with -v; the run's warnings."""
     place = tmp_path_factory.mktemp("order")
     outputs = []
     for further in ((), ("-v",)):
-        command = [sys.executable, "-m", "icrtool", "fit", str(LOG), *WRONG, "-o", "run", *further]
+        command = [sys.executable, "-m", "icrtool", "fit", str(short_segway_log), *WRONG, "-o", "run", *further]
         done = subprocess.run(command, cwd=place, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=True)
         outputs.append(done.stdout.decode().splitlines())
     document = json.loads((place / "run" / "run.json").read_text(encoding="utf-8"))
@@ -61,14 +59,15 @@ def test_a_wrong_robot_is_asked_for_with_the_radius_that_the_log_shows(
     assert not any("two full turns" in line for line in printed[0])
 
 
-def test_a_usable_run_names_the_command_that_tests_the_distance(icrtool, tmp_path: Path) -> None:
-    status, out, _ = icrtool("fit", LOG, "--robot", "segway-rmp400", "--plots", "none", "-o", tmp_path / "run")
+def test_a_usable_run_names_the_command_that_tests_the_distance(icrtool, tmp_path: Path, short_logs: Path) -> None:
+    log = short_logs / "field.mcap"
+    status, out, _ = icrtool("fit", log, "--robot", "husky-a200", "--plots", "none", "-o", tmp_path / "run")
     assert status == 0
     assert out.splitlines()[-2:] == [
         "distance    without GNSS: not known yet; the next command tests it",
         f"next        icrtool dropout-report {tmp_path / 'run'}",
     ]
     for further in ((), ("-v",)):
-        status, out, _ = icrtool("dropout-report", tmp_path / "run", "--plots", "none", *further)
+        status, out, _ = icrtool("dropout-report", tmp_path / "run", "--plots", "none", "--no-page", *further)
         assert status == 0
         assert out.count("How far without GNSS?") == 1

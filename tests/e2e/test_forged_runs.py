@@ -19,6 +19,9 @@ from icrtool.pipeline import fit, report_into
 from icrtool.records.requests import ReportRequest, ResultFiles
 from support.barn import configured, simulate
 from support.forged import Home, forge, remove
+from support.pictures import blank_pictures
+
+pytestmark = pytest.mark.usefixtures("without_drawing")
 
 LOG = Path(__file__).parents[2] / "sample_logs" / "tracked_curved.bag"
 
@@ -42,8 +45,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with its report, pictures and page."""
     directory = tmp_path_factory.mktemp("runs") / "barn"
     run = fit(simulate(duration_s=60.0), configured())
-    run.write(directory)
-    report_into(directory, run, ReportRequest(ladder=False), ResultFiles(), lambda _: None)
+    with blank_pictures():
+        run.write(directory)
+        report_into(directory, run, ReportRequest(ladder=False), ResultFiles(), lambda _: None)
     return directory
 
 
@@ -193,7 +197,7 @@ def test_the_directory_that_the_user_names_may_be_a_link(icrtool: Command, place
 
 
 @pytest.mark.parametrize(
-    ("first", "count"), [(0, 24), *(pytest.param(n, 100, marks=pytest.mark.stress) for n in (100, 200, 300))]
+    ("first", "count"), [(0, 12), *(pytest.param(n, 100, marks=pytest.mark.stress) for n in (100, 200, 300))]
 )
 def test_no_forged_run_changes_shows_or_hangs(
     icrtool: Command, made: Path, home: Home, run_place: Path, first: int, count: int
@@ -257,7 +261,7 @@ def season(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-BATCH = ("short.mcap", "-j", "1", "--robot", "pentzer-tracked", "--plots", "none", "--no-page")
+BATCH = ("short.mcap", "-j", "1", "--robot", "pentzer-tracked", "--plots", "none", "--no-page", "--no-ladder")
 
 
 @pytest.mark.parametrize("name", ["plots", ".rows", "runs", "runs/short"])

@@ -86,20 +86,12 @@ def test_too_little_memory_is_one_line(kilobytes: int) -> None:
         assert error_of(done.stderr).startswith("Error: memory: there is not enough")
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("info", "-"), ("fit", "-", "-o", "run"), ("dropout-report", "-", "-o", "run"), ("calibrate", "-"),
-        ("compare", "-"), ("batch", "-", "-o", "season"), ("report", "-"), ("simulate", "-o", "a.mcap"),
-        ("study", "consistency", "-o", "study", "--runs", "900"),
-    ],
-    ids=lambda one: one[0],
-)  # fmt: skip
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
-def test_a_closed_terminal_ends_each_command_as_sigterm_does(
-    tmp_path: Path, arguments: tuple[str, ...], number: signal.Signals
-) -> None:
-    """The signal comes from the first file that a command opens, when its handlers are set."""
+def test_a_closed_terminal_ends_a_command_as_sigterm_does(tmp_path: Path, number: signal.Signals) -> None:
+    """The signal comes when the handlers are set and no command is known yet: it is the same for all of them.
+
+    At work, commands are interrupted by tests/e2e/test_signals.py, with SIGHUP too.
+    """
     (tmp_path / "sitecustomize.py").write_text(
         "import os, sys\n"
         "class Hanging:\n"
@@ -111,7 +103,7 @@ def test_a_closed_terminal_ends_each_command_as_sigterm_does(
         "sys.meta_path.insert(0, Hanging())\n"
     )
     environment = {"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin:/bin", "TMPDIR": str(tmp_path)}
-    command = [sys.executable, "-m", "icrtool", *arguments]
+    command = [sys.executable, "-m", "icrtool", "fit", "-", "-o", "run"]
     done = subprocess.run(
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=50
     )

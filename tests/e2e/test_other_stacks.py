@@ -311,23 +311,31 @@ JOINTS = ("ublox_dgnss", "protobuf", "json", "json without schemas")
 NO_CLASS = ("protobuf", "json", "json without schemas")
 
 
+@pytest.fixture(scope="module")
+def place_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """What writes a log once, and returns its place."""
+    folder = tmp_path_factory.mktemp("log")
+    return functools.cache(lambda name: LOGS[name](folder / name.replace(" ", "_")))
+
+
+class Written(NamedTuple):
+    name: str
+    path: Path
+    log: RobotLog
+
+
 @pytest.fixture(scope="module", params=LOGS)
-def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    return request.param, LOGS[request.param](tmp_path_factory.mktemp("log") / request.param.replace(" ", "_"))
+def written(request: pytest.FixtureRequest, place_of: Callable[[str], Path]) -> Written:
+    path = place_of(request.param)
+    return Written(request.param, path, read_log(path, CONFIG))
 
 
-def log_of(path: Path) -> RobotLog:
-    return read_log(path, CONFIG)
+def test_the_sensors_of_the_stack_are_chosen(written: Written) -> None:
+    assert tuple(stream.topic for stream in written.log.streams) == TOPICS[written.name]
 
 
-def test_the_sensors_of_the_stack_are_chosen(written: tuple[str, Path]) -> None:
-    name, path = written
-    assert tuple(stream.topic for stream in log_of(path).streams) == TOPICS[name]
-
-
-def test_the_positions_are_those_that_were_measured(written: tuple[str, Path]) -> None:
-    name, path = written
-    fixes = log_of(path).gnss
+def test_the_positions_are_those_that_were_measured(written: Written) -> None:
+    name, fixes = written.name, written.log.gnss
     kept = np.isin(DRIVE.gnss.stamp_ns, fixes.stamp_ns)
     assert len(FIX_STAMPS) - len(fixes.stamp_ns) == {"ublox_dgnss": 2, "autopilot": 1}.get(name, 0)
     resolution_m = 0.012 if name == "ublox_dgnss" else 1e-3  # 1e-7 degrees of latitude
@@ -339,9 +347,8 @@ def test_the_positions_are_those_that_were_measured(written: tuple[str, Path]) -
     )
 
 
-def test_the_state_of_the_carrier_phase_is_read(written: tuple[str, Path]) -> None:
-    name, path = written
-    fixes = log_of(path).gnss
+def test_the_state_of_the_carrier_phase_is_read(written: Written) -> None:
+    name, fixes = written.name, written.log.gnss
     if name in NO_CLASS:
         assert fixes.stated_class is None
         return
@@ -350,18 +357,17 @@ def test_the_state_of_the_carrier_phase_is_read(written: tuple[str, Path]) -> No
     assert fixes.stated_class.tolist() == expected
 
 
-def test_the_wheels_travel_as_far_as_they_did(written: tuple[str, Path]) -> None:
-    name, path = written
-    wheels = log_of(path).wheels
-    per_unit = RADIUS_M if name in JOINTS else 1.0
+def test_the_wheels_travel_as_far_as_they_did(written: Written) -> None:
+    wheels = written.log.wheels
+    per_unit = RADIUS_M if written.name in JOINTS else 1.0
     seconds = np.diff(wheels.stamp_ns) / 1e9
     rounding_m = 1.1 / TICKS_PER_M
     for side, true in ((wheels.left, TRAVELLED[0]), (wheels.right, TRAVELLED[1])):
         np.testing.assert_allclose(np.cumsum(side[:-1] * seconds) * per_unit, true[1:] - true[0], atol=rounding_m)
 
 
-def test_info_lists_the_topics_and_fit_finds_the_icrs(written: tuple[str, Path], icrtool: Callable[..., Any]) -> None:
-    name, path = written
+def test_info_lists_the_topics_and_fit_finds_the_icrs(written: Written, icrtool: Callable[..., Any]) -> None:
+    name, path, _ = written
     setting = ("--set", f"robot.wheel_radius_m={RADIUS_M}")
     status, out, _ = icrtool("info", path, *setting, "-v")
     assert status == 0
@@ -376,7 +382,7 @@ def test_info_lists_the_topics_and_fit_finds_the_icrs(written: tuple[str, Path],
 
 def test_without_gga_the_fixes_of_rmc_are_used(tmp_path: Path) -> None:
     # RMC has no height: at 560 m a metre is 0.1 mm longer than at 0
-    log = log_of(write(tmp_path / "rmc", *autopilot(gga=False)))
+    log = read_log(write(tmp_path / "rmc", *autopilot(gga=False)), CONFIG)
     assert len(log.gnss.stamp_ns) == len(FIX_STAMPS) - 1
     np.testing.assert_allclose(
         log.gnss.north_m - log.gnss.north_m[0], NORTH[np.arange(len(NORTH)) != 5] - NORTH[0], atol=3e-3
@@ -386,10 +392,10 @@ def test_without_gga_the_fixes_of_rmc_are_used(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["protobuf", "json"])
-def test_poses_in_foxglove_s_schema_are_a_reference_of_position_and_heading(tmp_path: Path, kind: str) -> None:
-    log = read_log(
-        LOGS[kind](tmp_path / "poses"), load_config(sets=["topics.gnss=/mocap/pose", "topics.heading=/mocap/pose"])
-    )
+def test_poses_in_foxglove_s_schema_are_a_reference_of_position_and_heading(
+    place_of: Callable[[str], Path], kind: str
+) -> None:
+    log = read_log(place_of(kind), load_config(sets=["topics.gnss=/mocap/pose", "topics.heading=/mocap/pose"]))
     assert np.abs(log.gnss.north_m - NORTH).max() < 1e-9
     assert np.abs(log.gnss.east_m - EAST).max() < 1e-9
     turned = log.heading.heading_rad - headings_at(FIX_STAMPS)

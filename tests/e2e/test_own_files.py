@@ -49,6 +49,7 @@ def test_a_batch_goes_on_in_a_folder_of_its_own_and_keeps_a_page_of_somebody_els
     assert (season / "plots" / "icrs.txt").read_bytes() == OWN
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_a_page_in_its_usual_place_replaces_only_a_page(icrtool: Command, run_place: Path, short_logs: Path) -> None:
     log = short_logs / "other.bag"
     assert icrtool("fit", log, "--robot", "husky-a200", "--plots", "none", "-q")[0] == 0
@@ -108,12 +109,12 @@ def test_what_an_export_writes_under_a_name_of_its_own_replaces_only_its_like(
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory: pytest.TempPathFactory, short_logs: Path) -> Path:
     import icrtool
 
-    config = icrtool.load_config(sets=["robot.track_width_m=0.52"])
+    config = icrtool.load_config(robot="husky-a200")
     place = tmp_path_factory.mktemp("runs") / "run"
-    icrtool.fit(icrtool.read_log(LOG, config), config).write(place, plots=())
+    icrtool.fit(icrtool.read_log(short_logs / "other.bag", config), config).write(place, plots=())
     return place
 
 

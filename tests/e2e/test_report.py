@@ -52,6 +52,7 @@ def spaced(page: str) -> str:
     return page.replace("\xa0", " ").replace("&nbsp;", " ")
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_the_page_of_the_newest_run_is_in_its_directory(icrtool: Command, run_directory: Path) -> None:
     status, output, errors = icrtool("report")
     assert (status, errors) == (0, "")
@@ -63,10 +64,12 @@ def test_the_page_of_the_newest_run_is_in_its_directory(icrtool: Command, run_di
     assert not (run_directory / "dropout").exists()
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_a_dropout_report_writes_the_page_unless_it_is_not_wanted(icrtool: Command, run_directory: Path) -> None:
-    assert icrtool("dropout-report", run_directory, "--plots", "none", "--no-page")[0] == 0
+    lean = ("dropout-report", run_directory, "--plots", "none", "--no-ladder")
+    assert icrtool(*lean, "--no-page")[0] == 0
     assert not (run_directory / "report.html").exists()
-    assert icrtool("dropout-report", run_directory, "--plots", "none", "--budget", "0.123")[0] == 0
+    assert icrtool(*lean, "--budget", "0.123")[0] == 0
     written = (run_directory / "report.html").read_bytes()
     assert "within 0.123 m" in spaced(written.decode())
     # The page that is made from the files is the same; it draws the pictures that are missing.
@@ -76,6 +79,7 @@ def test_a_dropout_report_writes_the_page_unless_it_is_not_wanted(icrtool: Comma
     assert again.count(b"data:image/png") == written.count(b"data:image/png") + 3
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_figures_all_adds_those_of_the_paper(icrtool: Command, run_directory: Path) -> None:
     drawn = {}
     for figures in ("default", "all"):
@@ -87,7 +91,7 @@ def test_figures_all_adds_those_of_the_paper(icrtool: Command, run_directory: Pa
 
 
 def test_a_report_that_was_edited_is_refused_in_one_line(icrtool: Command, run_directory: Path) -> None:
-    icrtool("dropout-report", run_directory, "--plots", "none", "--no-page", "-q")
+    icrtool("dropout-report", run_directory, "--plots", "none", "--no-page", "--no-ladder", "-q")
     file = run_directory / "dropout" / "report.json"
     for change in ({"worst": [{"t_s": "soon"}]}, {"schema": "icrtool/dropout/99"}, {"models": None}):
         document = json.loads(file.read_bytes())
@@ -108,6 +112,7 @@ def test_what_is_no_result_has_no_page(icrtool: Command, place: str) -> None:
     assert errors.startswith(f"Error: {place}: no ")
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_report_of_a_log_answers_the_whole_question_and_fits_it_once(
     icrtool: Command, run_place: Path, field: Path
 ) -> None:
@@ -168,12 +173,14 @@ def calibration_rows(run: Path) -> list[dict[str, object]]:
     return [*rows, *document["calibrations"]]
 
 
+@pytest.mark.usefixtures("without_drawing")
 @pytest.mark.parametrize("further", [(), ("--refit-sensors",)])
 def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_has(
     icrtool: Command, run_place: Path, field: Path, other: Path, further: tuple[str, ...]
 ) -> None:
     asked = (field, *ROBOT, "--calibration", other.name, *further)
-    assert icrtool("dropout-report", *asked, "--plots", "none", "--no-page", "-o", "expected", "-q")[0] == 0
+    lean = ("--plots", "none", "--no-page")
+    assert icrtool("dropout-report", *asked, *lean, "-o", "expected", "-q")[0] == 0
     expected = calibration_rows(run_place / "expected")
     assert [one["name"] for one in expected if "by_horizon" in one][:1] == ["calibration"]
     assert ("(--refit-sensors)" in str(expected)) == bool(further)
@@ -185,6 +192,13 @@ def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_ha
     assert "calibration" in [line.split()[0] for line in shown.splitlines() if line.strip()]
     assert "not fitted to this log" in spaced((run / "report.html").read_text(encoding="utf-8"))
 
+    status, shown, errors = icrtool("batch", *asked, *lean, "-o", "results", "-j", "1")
+    assert (status, errors) == (0, "")
+    assert calibration_rows(run_place / "results" / "runs" / field.stem) == expected
+    assert "calibration_p95_10m_m" in (run_place / "results" / "fleet.csv").read_text(encoding="utf-8")
+
+    if further:
+        return
     # the report of a finished run is made again, from the run
     (run / "dropout" / "report.json").unlink()
     status, shown, errors = icrtool("report", run, *asked[1 + len(ROBOT) :])
@@ -193,11 +207,6 @@ def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_ha
     status, _, errors = icrtool("report", other.name, *asked[1 + len(ROBOT) :])
     assert status == 1
     assert "is no log and no run" in errors
-
-    status, shown, errors = icrtool("batch", *asked, "--plots", "none", "--no-page", "-o", "results", "-j", "1")
-    assert (status, errors) == (0, "")
-    assert calibration_rows(run_place / "results" / "runs" / field.stem) == expected
-    assert "calibration_p95_10m_m" in (run_place / "results" / "fleet.csv").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("command", [("dropout-report",), ("report",), ("batch", "-o", "results")])

@@ -51,10 +51,11 @@ def refused(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], 
 def test_terrain_changes_that_are_given_stand_in_table_and_run(run_in, tmp_path: Path) -> None:
     made = run_in(
         tmp_path, "simulate", "-o", "drive.mcap", "--robot", "segway-rmp400", "--icrs", "0.63,-0.76,0.06",
-        "--change", "60:0.85,-1.0,0", "--path", "figure-eight", "--duration", 120,
+        "--change", "60:0.85,-1.0,0", "--path", "figure-eight", "--duration", 120, "--wheel-rate", 20,
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
-    fitted = run_in(tmp_path, "fit", "drive.mcap", "--robot", "segway-rmp400", "--terrain-change", "60", "-o", "run")
+    asked = ("--terrain-change", "60", "--plots", "none", "-o", "run")
+    fitted = run_in(tmp_path, "fit", "drive.mcap", "--robot", "segway-rmp400", *asked)
     assert fitted.returncode == 0, fitted.stderr
     assert all(len(line) <= 100 for line in fitted.stdout.splitlines())
     segments = json.loads((tmp_path / "run" / "run.json").read_text())["segments"]

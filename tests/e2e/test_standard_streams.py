@@ -18,11 +18,10 @@ COMMAND = (sys.executable, "-m", "icrtool")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="/dev/full, and pipes as Linux has them")
 
 
-def test_a_full_disk_behind_standard_output_is_one_error() -> None:
+def test_a_full_disk_behind_standard_output_is_one_error(short_logs: Path) -> None:
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [*COMMAND, "info", LOG, *ROBOT], stdout=full, stderr=subprocess.PIPE, text=True, check=False
-        )
+        command = [*COMMAND, "info", short_logs / "field.mcap", *ROBOT]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     errors = [line for line in done.stderr.splitlines() if not line.startswith("Warning: ")]
     assert errors == ["Error: standard output: cannot be written; No space left on device"]
     assert done.returncode == 1
@@ -37,10 +36,11 @@ def test_a_standard_stream_that_was_closed_is_no_traceback(closed: int, status: 
     assert done.stderr in ("", "Error: standard output: cannot be written; Bad file descriptor\n")
 
 
-def test_a_reader_that_has_enough_stops_nothing(tmp_path: Path) -> None:
+def test_a_reader_that_has_enough_stops_nothing(tmp_path: Path, short_logs: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    command = [*COMMAND, "dropout-report", LOG, *ROBOT, "-o", "run", "--plots", "none", "--no-ladder", "--junit", "a"]
+    log, lean = short_logs / "field.mcap", ("--plots", "none", "--no-ladder", "--no-page")
+    command = [*COMMAND, "dropout-report", log, *ROBOT, "-o", "run", *lean, "--junit", "a"]
     failing = [*command, "--gate", "icr.p95@10m <= 0.001"]
     done = subprocess.run(failing, cwd=tmp_path, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writing)

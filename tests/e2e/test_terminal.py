@@ -25,6 +25,7 @@ from icrtool.fleet.processes import process_apart
 ROOT = Path(__file__).resolve().parents[2]
 ROWS, COLUMNS, MOST_LINES = 24, 80, 22
 ROBOT = ("--robot", "segway-rmp400")
+LEAN = ("--plots", "none", "--no-page", "--no-ladder")
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 Screen = Callable[..., tuple[int, list[str]]]
@@ -103,6 +104,7 @@ def check_fits(lines: list[str]) -> None:
     assert max(map(len, lines)) <= COLUMNS, "\n".join(lines)
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_a_good_drive_is_answered_on_one_screen(screen: Screen) -> None:
     status, lines = screen("fit", ROOT / "sample_logs" / "wheeled_lawnmower.mcap", *ROBOT, "--plots", "none")
     check_fits(lines)
@@ -156,7 +158,7 @@ def test_a_drive_that_shows_too_little_says_what_to_drive(screen: Screen) -> Non
     assert lines[0].startswith("Do not use: ")
     assert "two full turns" in " ".join(lines)
     assert "wheel_separation_multiplier" not in " ".join(lines)
-    status, lines = screen("dropout-report", "--plots", "none")
+    status, lines = screen("dropout-report", "--plots", "none", "--no-page")
     check_fits(lines)
     assert (status, lines[0][:11]) == (0, "Do not use:")
     assert "How far within" not in " ".join(lines)
@@ -175,14 +177,15 @@ def test_a_drive_with_turns_to_one_side_names_the_other(screen: Screen) -> None:
 
 def test_a_short_drive_states_why_the_recommended_model_is_left_out(screen: Screen) -> None:
     assert screen("simulate", "-o", "short.mcap", "--path", "curved", "--duration", "40", "-q", *ROBOT)[0] == 0
-    status, lines = screen("dropout-report", "short.mcap", *ROBOT, "--plots", "none")
+    status, lines = screen("dropout-report", "short.mcap", *ROBOT, "--plots", "none", "--no-page")
     check_fits(lines)
     assert status == 0
     assert any(line.startswith("left out    recommended, controller: ") for line in lines), "\n".join(lines)
 
 
 def test_without_a_track_width_no_slip_is_not_known(screen: Screen) -> None:
-    status, lines = screen("dropout-report", ROOT / "sample_logs" / "tracked_curved.bag", "--plots", "none")
+    log = ROOT / "sample_logs" / "tracked_curved.bag"
+    status, lines = screen("dropout-report", log, "--plots", "none", "--no-page")
     check_fits(lines)
     text = " ".join(" ".join(lines).split())
     assert status == 0
@@ -192,11 +195,9 @@ def test_without_a_track_width_no_slip_is_not_known(screen: Screen) -> None:
 def test_all_is_printed_on_request_and_a_narrow_terminal_loses_no_column_without_notice(screen: Screen) -> None:
     rates = ("--wheel-rate", "20", "--heading-rate", "20", "--gnss-rate", "5")
     assert screen("simulate", "-o", "log.mcap", "--path", "curved", "--duration", "80", "-q", *ROBOT, *rates)[0] == 0
-    _, brief = screen("dropout-report", "log.mcap", *ROBOT, "--plots", "none", "--no-page")
+    _, brief = screen("dropout-report", "log.mcap", *ROBOT, *LEAN)
     check_fits(brief)
-    full, lines = (
-        screen("dropout-report", "--plots", "none", "--no-page", "-v", columns=columns)[1] for columns in (COLUMNS, 60)
-    )
+    full, lines = (screen("dropout-report", *LEAN, "-v", columns=columns)[1] for columns in (COLUMNS, 60))
     assert len(full) > 2 * len(brief)
     text = " ".join(" ".join(lines).split())
     assert "left out: the terminal has 60 columns" in text
@@ -234,15 +235,15 @@ def test_the_next_command_of_an_unusable_run_names_the_log_and_the_options(scree
     assert command == ["icrtool", "info", "two words.mcap", "-v", *given]
 
 
-def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Screen) -> None:
-    logs = [ROOT / "sample_logs" / name for name in ("wheeled_lawnmower.mcap", "wheeled_figure_eight")]
-    status, lines = screen("calibrate", *logs, *ROBOT)
+def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Screen, short_logs: Path) -> None:
+    logs, robot = [short_logs / name for name in ("field.mcap", "other.bag")], ("--robot", "husky-a200")
+    status, lines = screen("calibrate", *logs, *robot)
     check_fits(lines)
     assert status == 0
     assert "wheel_separation_multiplier" in "\n".join(lines)
     assert "How far within 0.5 m (95 %), each log left out in turn?" in lines
     assert "omega_sw" not in "\n".join(lines)
-    status, brief = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *ROBOT)
+    status, brief = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *robot)
     check_fits(brief)
     text = " ".join("\n".join(brief).split())
     assert status == 0
@@ -250,7 +251,7 @@ def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Scree
     assert "Multiplier: b minus a is +" in text
     assert "The calibration of a, used on b, changes the error by " in text
     assert "error [m] after 10 m, calibrated on row, tested on column" in text
-    full = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *ROBOT, "-v")[1]
+    full = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *robot, "-v")[1]
     assert len(full) > len(brief) + 8
 
 
