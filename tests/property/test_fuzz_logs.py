@@ -242,7 +242,7 @@ def test_good_logs_are_read(good_logs, kind, wheels):
 
 @pytest.mark.parametrize("kind", [*MCAP, *OTHERS])
 def test_mutated_logs_are_read_or_refused_in_one_line(good_logs, tmp_path, kind):
-    fuzz(good_logs, tmp_path, kind, examples=40)
+    fuzz(good_logs, tmp_path, kind, examples=25)
 
 
 @pytest.mark.stress

@@ -65,7 +65,7 @@ def assert_equal(errors, expected):
     np.testing.assert_allclose(errors, expected, rtol=0.0, atol=EQUAL_M)
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(drives(), st.sampled_from([8, 37, 2048]))
 def test_fast_equals_direct_integration(drive_and_icrs, block):
     drive, icrs = drive_and_icrs

@@ -79,8 +79,11 @@ EVERY_OPTION = [
 
 @pytest.mark.parametrize("options", EVERY_OPTION, ids=lambda options: " ".join(map(str, options)) or "defaults")
 def test_every_option_reads_back_to_the_icrs_it_was_made_with(tmp_path: Path, options: tuple[object, ...]) -> None:
-    duration = () if "--duration" in options else ("--duration", 60)
-    assert_found(*round_trip(tmp_path, *duration, *options))
+    usual = {"--duration": 60, "--wheel-rate": 50, "--heading-rate": 50, "--gnss-rate": 10}
+    if "commanded" in options:
+        del usual["--wheel-rate"]
+    further = [word for name, value in usual.items() if name not in options for word in (name, value)]
+    assert_found(*round_trip(tmp_path, *further, *options))
 
 
 def test_a_straight_drive_shows_no_icr_and_its_sigma_covers_the_truth(tmp_path: Path) -> None:
