@@ -33,7 +33,8 @@ def prior_for(
     at those that were corrected in this log, as for row ``icr``: between five drives of one robot, recorded by one
     computer, they differ by 0.08 s.
     """
-    calibration = next((one for one in calibrations if not one.fitted_to(recording.sha256)), None)
+    unfitted = (calibration for calibration in calibrations if not calibration.fitted_to(recording.sha256))
+    calibration = next(unfitted, None)
     if calibration is None:
         return prior_of_robots(recording.width_m)
     constants = recording.corrected._replace(wheels_later_s=np.nan, gyro_later_s=np.nan)
@@ -83,9 +84,9 @@ class KnownDrive:
 
     def path(self, start: int, end: int, *, turned: bool = False) -> OpenLoopPath:
         """Return the path from one state to another, with the model that was known at the first state."""
-        one = np.array([start], np.int64)
-        ((number, _),) = self._by_learned(one)
-        steps = self._steps_around(one, np.array([end], np.int64))
+        starts = np.array([start], np.int64)
+        ((number, _),) = self._by_learned(starts)
+        steps = self._steps_around(starts, np.array([end], np.int64))
         return path_between(self.recording, self._known(number, turned=turned), steps, start, end)
 
     def _steps_around(self, start: Ints, end: Ints | Rows) -> Track:
@@ -96,15 +97,19 @@ class KnownDrive:
 
     def _by_learned(self, starts: Ints) -> Iterator[tuple[int, slice]]:
         """Yield rows of the starts (ascending), and the number of the item of `learned` that was known at them."""
-        known_s = np.array([one.t_s for one in self.learned])
+        known_s = np.array([learned.t_s for learned in self.learned])
         number = np.searchsorted(known_s, self.recording.track.t[starts], side="right") - 1
         first = np.flatnonzero(np.diff(number, prepend=-1))
         for lo, hi in zip(first.tolist(), [*first[1:].tolist(), len(starts)], strict=True):
             yield int(number[lo]), slice(lo, hi)
 
     def _known(self, number: int, *, turned: bool) -> Prediction:
-        one = self.learned[number]
-        return (one.turned, one.turned_constants) if turned and one.turned is not None else (one.fitted, one.constants)
+        learned = self.learned[number]
+        return (
+            (learned.turned, learned.turned_constants)
+            if turned and learned.turned is not None
+            else (learned.fitted, learned.constants)
+        )
 
 
 def adapt(recording: Recording, prior: TermsPrior, past: Recording | None = None) -> KnownDrive:

@@ -62,7 +62,7 @@ class Spread(NamedTuple):
 
     def combined(self, variances: Floats) -> Spread:
         """Return the moments (w, 1) for variances (c,) of the sources."""
-        return Spread(*((one @ variances)[:, None] for one in self))
+        return Spread(*((moments @ variances)[:, None] for moments in self))
 
     def plus(self, other: Spread) -> Spread:
         """Return the moments of independent errors together."""
@@ -132,13 +132,15 @@ def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread
         (theta[e] - theta[s], by_turn),
         (0.0 * driven, back * went),
     ]
-    one, first = np.abs(step), between(np.abs(step) * middle)
-    zero = between(one)
+    driven_m, first = np.abs(step), between(np.abs(step) * middle)
+    zero = between(driven_m)
     # sum of q (S_e - S_u)(S_e - S_u)^T along the path, as squared length and as the square of the complex number
-    size = zero * np.abs(place[e]) ** 2 - 2.0 * (np.conj(place[e]) * first).real + between(one * np.abs(middle) ** 2)
-    square = (zero * place[e] ** 2 - 2.0 * place[e] * first + between(one * middle**2)) * (1j * back) ** 2
+    size = (
+        zero * np.abs(place[e]) ** 2 - 2.0 * (np.conj(place[e]) * first).real + between(driven_m * np.abs(middle) ** 2)
+    )
+    square = (zero * place[e] ** 2 - 2.0 * place[e] * first + between(driven_m * middle**2)) * (1j * back) ** 2
     wander = _from_squares(driven, size, square)
-    along = np.divide(step**2, one, out=np.zeros(len(step), np.complex128), where=one > 0.0)
+    along = np.divide(step**2, driven_m, out=np.zeros(len(step), np.complex128), where=driven_m > 0.0)
     speed = _from_squares(0.0 * driven, zero, between(along) * back**2)
     moments = [Spread(h**2, p.real**2, p.real * p.imag, p.imag**2) for h, p in constant]
     ones, none = np.ones(len(s)), np.zeros(len(s))
@@ -273,8 +275,8 @@ def forecast_plan(
     held = np.abs(step / speed)
     turn = np.append(np.diff(direction), 0.0) / held
     left, right = wheel_speeds(calibration.fitted, calibration.width_m, speed, turn)
-    t, distance = (np.concatenate([[0.0], np.cumsum(one)]) for one in (held, np.abs(step)))
-    left, right, turn, direction = (np.append(one, one[-1:]) for one in (left, right, turn, direction))
+    t, distance = (np.concatenate([[0.0], np.cumsum(steps)]) for steps in (held, np.abs(step)))
+    left, right, turn, direction = (np.append(column, column[-1:]) for column in (left, right, turn, direction))
     planned = Track.of_states(
         t, np.append(held, 0.0), left, right, path.real, path.imag, direction, distance
     )._replace(gyro=turn, into=0.5)  # fmt: skip

@@ -138,7 +138,7 @@ class HeldOut:
         first = np.searchsorted(np.concatenate(fold_of), np.arange(1, len(self.folds)))
         scores = []
         for name in self.rows:
-            errors = np.concatenate([self.errors(name, i, one).position for i, one in enumerate(self.trials)])
+            errors = np.concatenate([self.errors(name, i, trials).position for i, trials in enumerate(self.trials)])
             by_fold = tuple(error_summary(some) for some in np.split(errors, first))
             scores.append(HeldOutRow(name, by_fold, error_summary(errors)))
         return tuple(scores)
@@ -213,7 +213,7 @@ def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
         A single drive is too short to hold anything out.
     """
     if len(recordings) > 1:
-        return tuple(Fold(one.name, i, i, -np.inf, np.inf) for i, one in enumerate(recordings))
+        return tuple(Fold(recording.name, i, i, -np.inf, np.inf) for i, recording in enumerate(recordings))
     total = float(recordings[0].track.distance[-1])
     if total < 2.0 * CHOICE_HORIZON_M:
         raise DataError(recordings[0].name, f"{total:.1f} m of driven distance", TOO_SHORT)
@@ -243,8 +243,8 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
     pair = of_start * (last + 1) + of_end
     order = np.argsort(pair, kind="stable")
     pairs, first = np.unique(pair[order], return_index=True)
-    for one, rows in zip(pairs.tolist(), np.split(order, first[1:]), strict=True):
-        a, b = divmod(one, last + 1)
+    for pair_number, rows in zip(pairs.tolist(), np.split(order, first[1:]), strict=True):
+        a, b = divmod(pair_number, last + 1)
         block = mine[a // in_block]
         yield block._replace(begin_m=a * strip_m, end_m=(b + 1) * strip_m), rows
 
@@ -285,13 +285,16 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
         Too short a drive.
     """
     pooled = totals_of(*recordings)
-    pool = Pool([cut_windows(one, pooled=pooled) for one in recordings], [one.width_m for one in recordings])
+    pool = Pool(
+        [cut_windows(recording, pooled=pooled) for recording in recordings],
+        [recording.width_m for recording in recordings],
+    )
     fits = {name: pool.fit(MODELS[name]) for name in names}
     if FIVE in fits:
         # All logs have the clocks of one robot, so many logs show a constant delay no better than a single log.
-        off = float(np.sqrt(np.mean([one.x_clock_std_m**2 for one in recordings])))
+        off = float(np.sqrt(np.mean([recording.x_clock_std_m**2 for recording in recordings])))
         fits[FIVE] = fits[FIVE].with_clock_error(off)
-    if all(one.track.gyro is not None for one in recordings):
+    if all(recording.track.gyro is not None for recording in recordings):
         fits |= {f"{name}{GYRO_SUFFIX}": pool.fit(MODELS[name].with_gyro(), fits[name]) for name in names}
     return fits
 
@@ -314,7 +317,7 @@ def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HELD
         if np.count_nonzero(fits[RECOMMENDED].pool.clear_of(fold)) < FEWEST_RESIDUALS:
             raise DataError(fold.name, "too few windows outside it", TOO_SHORT)
     pooled = totals_of(*recordings)
-    trials = tuple(cut_trials(one, horizons_m, pooled) for one in recordings)
+    trials = tuple(cut_trials(recording, horizons_m, pooled) for recording in recordings)
     return HeldOut(tuple(recordings), tuple(horizons_m), folds, trials, fits)
 
 
@@ -356,18 +359,20 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
         stretch = np.floor(windows.track.distance[windows.begin] / windows.length_m)
         tested.append(np.column_stack([np.full(len(stretch), i), windows.length_m, stretch]))
     stretches = Counter(np.unique(np.concatenate(tested), axis=0)[:, 1].tolist())
-    measured_to_m = max(one for one in LENGTHS_M if one <= ALWAYS_TO_M or stretches[one] >= FEWEST_STRETCHES)
-    length = np.concatenate([one[0] for one in of_logs]) if of_logs else np.empty(0)
+    measured_to_m = max(
+        length_m for length_m in LENGTHS_M if length_m <= ALWAYS_TO_M or stretches[length_m] >= FEWEST_STRETCHES
+    )
+    length = np.concatenate([log[0] for log in of_logs]) if of_logs else np.empty(0)
     used = length <= measured_to_m
     length = length[used]
     if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_HELD_OUT_WINDOWS:
         return None
-    of_sources, of_parameters = ([getattr(one[1], part) for one in of_logs] for part in ("of_sources", "of_parameters"))
+    of_sources, of_parameters = ([getattr(log[1], part) for log in of_logs] for part in ("of_sources", "of_parameters"))
     sources, stated = (
         error_growth.Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
         for parts in (of_sources, of_parameters)
     )
-    turned, missed = (np.concatenate([one[k] for one in of_logs])[used] for k in (2, 3))
+    turned, missed = (np.concatenate([log[k] for log in of_logs])[used] for k in (2, 3))
     variances = error_growth.fit_variances(length, sources, stated, turned, missed)
     spread, far = sources.combined(variances).plus(stated), length >= SCALED_FROM_M
     error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
@@ -443,7 +448,7 @@ def _window_errors(table: HeldOut, name: str, length_m: float) -> tuple[Floats, 
     for i, windows, predicted in _left_out_windows(table, name, [length_m]):
         path = predicted_path(table.recordings[i], *predicted, windows.track)
         begin, end = (windows.track.place_t[at] for at in (windows.begin, windows.end))
-        (theta, turned), (place, moved) = (np.split(one, 2) for one in path(np.append(begin, end)))
+        (theta, turned), (place, moved) = (np.split(column, 2) for column in path(np.append(begin, end)))
         error = np.exp(-1j * theta) * (moved - place) - windows.moved
         turn = windows.turned
         off = turned - theta - turn

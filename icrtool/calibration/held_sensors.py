@@ -52,7 +52,8 @@ def sensors_of(
     fitted, turned : models of the calibration, with wheels alone and with a gyro
     """
     of_models = [
-        None if one is None else constants_document(measured_in(recording, windows, one)) for one in (fitted, turned)
+        None if model is None else constants_document(measured_in(recording, windows, model))
+        for model in (fitted, turned)
     ]
     return documents.LogSensors(recording.heading_source, of_models[0] or documents.SensorConstants(), of_models[1])
 
@@ -76,9 +77,9 @@ def known_constants(document: documents.SensorConstants) -> KnownConstants:
     """Return the constants of a document; NaN where it has none."""
     both = np.full((2, len(_TO_DOCUMENT)), np.nan)
     for column, name in enumerate(documents.SensorConstants.__struct_fields__):
-        one: documents.MeasuredConstant | None = getattr(document, name)
-        if one is not None:
-            both[:, column] = one.value / _TO_DOCUMENT[column], one.std / abs(_TO_DOCUMENT[column])
+        constant: documents.MeasuredConstant | None = getattr(document, name)
+        if constant is not None:
+            both[:, column] = constant.value / _TO_DOCUMENT[column], constant.std / abs(_TO_DOCUMENT[column])
     return KnownConstants(*(LogConstants(*row) for row in both.tolist()))
 
 
@@ -99,19 +100,19 @@ def pooled_constants(
     deviation holds for a further drive. The variance between drives is the variance of the logs beyond their own
     uncertainty (`between_variance`), pooled with `BETWEEN_DRIVES_STD`, which stands alone for one or two logs.
     """
-    stored = [one.sensors for one in logs if one.sensors is not None]
-    sources = {one.heading_source for one in stored}
+    stored = [log.sensors for log in logs if log.sensors is not None]
+    sources = {sensors.heading_source for sensors in stored}
     if heading_source is None and len(sources) == 1:
         (heading_source,) = sources
-    of_logs = [(one.heading_source, one.gyro if with_gyro else one.wheels) for one in stored]
-    of_sources = [(source, known_constants(one)) for source, one in of_logs if one is not None]
+    of_logs = [(sensors.heading_source, sensors.gyro if with_gyro else sensors.wheels) for sensors in stored]
+    of_sources = [(source, known_constants(constants)) for source, constants in of_logs if constants is not None]
     pairs = []
     for column, usual_std in enumerate(BETWEEN_DRIVES_STD):
         of_offset = column == 0
         some = np.array([
-            (one.mean[column], one.std[column])
-            for source, one in of_sources
-            if math.isfinite(one.mean[column]) and not (of_offset and source != heading_source)
+            (constants.mean[column], constants.std[column])
+            for source, constants in of_sources
+            if math.isfinite(constants.mean[column]) and not (of_offset and source != heading_source)
         ])  # fmt: skip
         if of_offset and len(some):
             # angles about the first one
@@ -157,9 +158,9 @@ def words_of(names: Iterable[str]) -> str:
 
 def constant_text(constants: documents.SensorConstants, name: str) -> str:
     """Return a constant with its standard deviation and unit; empty where it is not known."""
-    one: documents.MeasuredConstant | None = getattr(constants, name)
+    constant: documents.MeasuredConstant | None = getattr(constants, name)
     _, unit, digits = CONSTANT_WORDS[name]
-    return "" if one is None else f"{one.value:+z.{digits}f} ± {one.std:.{digits}f}{unit}"
+    return "" if constant is None else f"{constant.value:+z.{digits}f} ± {constant.std:.{digits}f}{unit}"
 
 
 def contradictions(row: str, sensors: documents.HeldSensors, among: Iterable[str]) -> list[Note]:

@@ -89,7 +89,9 @@ def localization(calibration: Calibration, run: Run | None = None) -> Localizati
         raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
     source = f"held-out errors of the controller's model over {TWIST_OVER_M:g} m"
     stds = errors.twist_variance_std or (None, None, None)
-    v_x, v_y, yaw_rate = (Estimate(*one, source) for one in zip(errors.twist_variance, stds, strict=True))
+    v_x, v_y, yaw_rate = (
+        Estimate(*variance_and_std, source) for variance_and_std in zip(errors.twist_variance, stds, strict=True)
+    )
     gyro_rate = None
     if errors.gyro_rate_variance is not None:
         of_gyro = f"held-out errors of the model with the gyro over {TWIST_OVER_M:g} m, the reference's noise included"
@@ -114,7 +116,9 @@ def localization(calibration: Calibration, run: Run | None = None) -> Localizati
 
 def _topics(run: Run) -> tuple[str, str]:
     """Return the topic of the wheels' odometry and of the gyro, empty where the log has none."""
-    wheels = next((one.topic for one in run.document.streams if one.role == "wheels" and _is_odometry(one)), "")
+    wheels = next(
+        (stream.topic for stream in run.document.streams if stream.role == "wheels" and _is_odometry(stream)), ""
+    )
     return wheels, "" if run.sensors.gyro is None else run.sensors.gyro.topic.partition(" (")[0]
 
 
@@ -189,7 +193,7 @@ def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
     which is positive where magnetic north lies east of north.
     """
     sensor, heading = run.sensors.facts.heading_sensor, run.document.heading
-    fixes = next((one.message_type for one in run.document.streams if one.role == "gnss"), "")
+    fixes = next((stream.message_type for stream in run.document.streams if stream.role == "gnss"), "")
     reason = ""
     if fixes != FIX_TYPE:
         reason = f"it reads {FIX_TYPE}, and the positions are {fixes or 'of another type'}"
@@ -230,8 +234,8 @@ def _antenna(run: Run) -> tuple[AntennaPlace | None, str]:
         (ANTENNA_AHEAD, "antenna forward - x ICR"),
         (ANTENNA_ASIDE, "antenna right - middle of the ICRs"),
     ):
-        one = run.document.alignment.get(key)
-        if one is not None and one.value is not None and one.std is not None:
-            words.append(f"{label} = {one.value:+z.3f} ± {one.std:.3f} m")
+        finding = run.document.alignment.get(key)
+        if finding is not None and finding.value is not None and finding.std is not None:
+            words.append(f"{label} = {finding.value:+z.3f} ± {finding.std:.3f} m")
     shown = f"; positions show {' and '.join(words)}" if words else ""
     return None, f"place of the antenna: not in the log{shown}; measure it and set frames.antenna_forward_m, _right_m"

@@ -45,8 +45,8 @@ def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -
     if len(names) < FEWEST_GROUNDS:
         return ()
     for ground in names:
-        others = [one for one, of in zip(recordings, grounds, strict=True) if of != ground]
-        mine = [one for one, of in zip(recordings, grounds, strict=True) if of == ground]
+        others = [recording for recording, of in zip(recordings, grounds, strict=True) if of != ground]
+        mine = [recording for recording, of in zip(recordings, grounds, strict=True) if of == ground]
         with suppress(DataError):
             scores += _scores(ground, mine, fit_models(others, (FIVE, RECOMMENDED)))
     return tuple(scores)
@@ -55,8 +55,8 @@ def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -
 def _scores(ground: str, recordings: Sequence[Recording], fits: Mapping[str, PooledFit]) -> Iterator[GroundScore]:
     """Yield the errors in the recordings of a ground, by row and distance."""
     errors: dict[str, list[Floats]] = {}
-    for one in recordings:
-        for name, position in _errors(one, cut_trials(one, GROUND_HORIZONS_M), fits):
+    for recording in recordings:
+        for name, position in _errors(recording, cut_trials(recording, GROUND_HORIZONS_M), fits):
             errors.setdefault(name, []).append(position)
     for name, parts in errors.items():
         if len(parts) < len(recordings):
@@ -109,13 +109,13 @@ def other_ground_ends(
     """
     spread_std = row_of(row).spread.grounds
     by_horizon: dict[float, list[float]] = {}
-    for one in scores:
-        if one.model == row and one.p95_m > 0.0:
-            by_horizon.setdefault(one.horizon_m, []).append(one.p95_m)
+    for score in scores:
+        if score.model == row and score.p95_m > 0.0:
+            by_horizon.setdefault(score.horizon_m, []).append(score.p95_m)
     p95_by_horizon = {metres: p95_m for metres, p95_m in sorted(by_horizon.items()) if len(p95_m) >= FEWEST_GROUNDS}
     if not p95_by_horizon:
         return None
     ends = np.array([ground_interval(np.array(p95_m), spread_std) for p95_m in p95_by_horizon.values()])
     reached = [within_budget(np.array(list(p95_by_horizon)), ends[:, column], budget_m) for column in (1, 0)]
-    low, high = (None if one is None or one[1] else one[0] for one in reached)
+    low, high = (None if end is None or end[1] else end[0] for end in reached)
     return low, high

@@ -128,7 +128,9 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | 
 
 def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
     """Return `recording_of` a run with its measured heading of one kind (``gyro`` or ``heading``), if it has one."""
-    return recording_of(run, next((one for one in measured_headings(run) if one.kind == kind), None), width_m=width_m)
+    return recording_of(
+        run, next((heading for heading in measured_headings(run) if heading.kind == kind), None), width_m=width_m
+    )
 
 
 def gyro_line(recording: Recording) -> PastLines:
@@ -183,15 +185,17 @@ def calibrate_recordings(
     DataError
         Too short a drive.
     """
-    widths = {one.width_m for one in recordings}
+    widths = {recording.width_m for recording in recordings}
     if len(widths) > 1:
         widths_text = ", ".join(f"{width:g} m" for width in sorted(widths))
         raise ConfigError("robot.track_width_m", f"{widths_text} in the logs given", "calibrate one robot at a time")
-    with_sum = [one for one in recordings if one.sha256]
-    if twice := {one.name for one in with_sum if sum(one.sha256 == other.sha256 for other in with_sum) > 1}:
+    with_sum = [recording for recording in recordings if recording.sha256]
+    if twice := {
+        recording.name for recording in with_sum if sum(recording.sha256 == other.sha256 for other in with_sum) > 1
+    }:
         raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
     table = held_out.hold_out(recordings)
-    turnless = ", ".join(one.name for one in recordings if one.track.gyro is None)
+    turnless = ", ".join(recording.name for recording in recordings if recording.track.gyro is None)
     text = f"no gyro that turns with the robot in {turnless}: wheels alone"
     notes = (note("gyro_not_used", text),) if turnless else ()
     calibration = calibration_from(table, robot, findings)
@@ -222,12 +226,14 @@ def calibration_from(
     recordings, best = table.recordings, table.fits[RECOMMENDED]
     with_gyro = table.fits[f"{RECOMMENDED}{held_out.GYRO_SUFFIX}"].fitted if has_gyro else None
     logs = []
-    for i, one in enumerate(recordings):
-        own, metres = best.constants(i), float(one.track.distance[-1])
+    for i, recording in enumerate(recordings):
+        own, metres = best.constants(i), float(recording.track.distance[-1])
         offset_deg, delay_s = math.degrees(own.heading_offset_rad), -own.wheels_later_s
-        sensors = sensors_of(one, best.pool.windows[i], best.fitted, with_gyro)
-        numbers = metres, offset_deg, delay_s, one.begin_ns
-        logs.append(documents.CalibrationLog(one.name, one.path, one.sha256, *numbers, sensors=sensors))
+        sensors = sensors_of(recording, best.pool.windows[i], best.fitted, with_gyro)
+        numbers = metres, offset_deg, delay_s, recording.begin_ns
+        logs.append(
+            documents.CalibrationLog(recording.name, recording.path, recording.sha256, *numbers, sensors=sensors)
+        )
     by_fold, together = [], []
     for row in table.scores:
         # A score without trials is left out.
@@ -266,7 +272,7 @@ def calibration_from(
         held_out_pooled=tuple(together),
         error_sources=held_out.measure_error_sources(table, RECOMMENDED),
         notes=findings,
-        warnings=tuple(one.sentence for one in findings),
+        warnings=tuple(finding.sentence for finding in findings),
     )
 
 
@@ -368,15 +374,15 @@ def calibrate_runs(
         recording = turning_recording_of(run)
         robot = robot_of(run, recording.width_m)
         positions = run.sensors.fixes.north_m + 1j * run.sensors.fixes.east_m
-        one = _Taken(recording, positions, robot, use_notes(run, alone=False), ground)
-        if why := _why_left_out(run, one, taken, allow_unusable=allow_unusable):
+        candidate = _Taken(recording, positions, robot, use_notes(run, alone=False), ground)
+        if why := _why_left_out(run, candidate, taken, allow_unusable=allow_unusable):
             left_out.append(LeftOut(run.name, why))
             continue
-        parts = [_is_part(before, one) for before in taken]
+        parts = [_is_part(before, candidate) for before in taken]
         left_out += [LeftOut(taken[i].recording.name, f"a part of {run.name}") for i in np.flatnonzero(parts)]
-        taken = [*(before for before, is_part in zip(taken, parts, strict=True) if not is_part), one]
+        taken = [*(before for before, is_part in zip(taken, parts, strict=True) if not is_part), candidate]
         alone = use_notes(run)
-    recordings, robots = [one.recording for one in taken], [one.robot for one in taken]
+    recordings, robots = [log.recording for log in taken], [log.robot for log in taken]
     if not recordings:
         if not left_out:
             raise ConfigError("runs", "no usable one is given", "name at least one run or log")
@@ -386,8 +392,8 @@ def calibrate_runs(
     if len(radii_m := {robot.wheel_radius_m for robot in robots}) > 1:
         why = f"{' and '.join(sorted(map(str, radii_m)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
-    notes = alone if len(taken) == 1 else tuple(dict.fromkeys(notes for one in taken for notes in one.notes))
-    named = [one.ground for one in taken] if all(one.ground for one in taken) else []
+    notes = alone if len(taken) == 1 else tuple(dict.fromkeys(notes for log in taken for notes in log.notes))
+    named = [log.ground for log in taken] if all(log.ground for log in taken) else []
     return calibrate_recordings(recordings, robots[0], notes, named)._replace(left_out=tuple(left_out))
 
 
@@ -415,7 +421,9 @@ def _is_part(log: _Taken, longer_log: _Taken) -> bool:
     that were computed from wheel positions may differ at the ends of the part.
     """
     part, whole = log.recording, longer_log.recording
-    stamps, theirs = (np.rint(1e9 * one.track.t).astype(np.int64) + one.begin_ns for one in (part, whole))
+    stamps, theirs = (
+        np.rint(1e9 * recording.track.t).astype(np.int64) + recording.begin_ns for recording in (part, whole)
+    )
     if not (len(stamps) < len(theirs) and theirs[0] <= stamps[-1] and stamps[0] <= theirs[-1]):
         return False
     _, ours, others = np.intersect1d(stamps, theirs, assume_unique=True, return_indices=True)

@@ -86,8 +86,8 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     name: str | UnsetType = UNSET
 
     def __post_init__(self) -> None:
-        for name, one in self.models.items():
-            fitted_model(name, one)
+        for name, fitted in self.models.items():
+            fitted_model(name, fitted)
         _ = self.fitted_with_gyro
         if not set(TrackGeometry._fields) <= self.geometry.keys() & self.geometry_std.keys():
             raise ValueError("its geometry is not complete")
@@ -120,7 +120,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     @property
     def controller_errors(self) -> documents.ControllerErrors | None:
         """Errors of the controller's model; None where the drive is too short to measure them."""
-        errors = {name: one for name, one in msgspec.structs.asdict(self.controller).items() if one is not UNSET}
+        errors = {name: error for name, error in msgspec.structs.asdict(self.controller).items() if error is not UNSET}
         return msgspec.convert(errors, documents.ControllerErrors) if "pose_variance" in errors else None
 
     def log_names(self) -> str:
@@ -130,9 +130,9 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
 
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
         """Return p95 and expected error [m] of all held-out trials of a model together, NaN without trials."""
-        for one in self.held_out_pooled:
-            if one.model == model and one.horizon_m == horizon_m:
-                return one.p95_m, one.expected_m
+        for score in self.held_out_pooled:
+            if score.model == model and score.horizon_m == horizon_m:
+                return score.p95_m, score.expected_m
         return math.nan, math.nan
 
     def twist(self, v_left: Floats | float, v_right: Floats | float, *, frame: Frame = "ned") -> Floats:
@@ -355,7 +355,7 @@ LARGEST_SHARE = 0.5
 
 def unfit_reasons(calibration: Calibration) -> tuple[Note, ...]:
     """Return why a calibration is not fit for use, from its held-out errors; empty where it is fit."""
-    reasons = [one for one in calibration.notes if is_grave(one)]
+    reasons = [finding for finding in calibration.notes if is_grave(finding)]
     p95, expected = calibration.held_out_m(RECOMMENDED, POSE_AFTER_M)
     _, without = calibration.held_out_m(NO_SLIP, POSE_AFTER_M)
     if p95 > LARGEST_SHARE * POSE_AFTER_M:
@@ -376,7 +376,7 @@ def export_notes(calibration: Calibration, model: str = RECOMMENDED) -> tuple[No
     ----------
     model : whose terms are used: a controller has no parameter for the last three of `RECOMMENDED`
     """
-    reasons = [one for one in unfit_reasons(calibration) if one not in calibration.notes]
+    reasons = [reason for reason in unfit_reasons(calibration) if reason not in calibration.notes]
     for name in (name for name in calibration.fitted.not_shown if name in MODELS[model].terms):
         why = f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
         reasons.append(note("parameter_not_shown", why))

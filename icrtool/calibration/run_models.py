@@ -98,7 +98,7 @@ def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocumen
     """
     if not document.usable:
         return document
-    changed = next((one.text for one in document.notes if one.code == "ground_changed"), "")
+    changed = next((finding.text for finding in document.notes if finding.code == "ground_changed"), "")
     if changed and not document.request.changes_s:
         return msgspec.structs.replace(document, partly_because=changed)
     hidden = [ICR_WORDS[name] for name in ICR_COLUMNS if document.icr_of_drive(name) is None]
@@ -245,14 +245,14 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
     """Return the recording with the first measured heading that turns with the robot, its kind, and notes."""
     notes = list[Note]()
     plain = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
-    for one in headings:
-        with_rate = pooled.with_turn_rate(plain, one, run.config.frames.gyro_delay_s)
+    for measured in headings:
+        with_rate = pooled.with_turn_rate(plain, measured, run.config.frames.gyro_delay_s)
         if with_rate.track.gyro is not None:
             if with_rate.gyro_reversed:
-                why = f"the {one.kind} counts turns in the other direction: its sign was changed"
+                why = f"the {measured.kind} counts turns in the other direction: its sign was changed"
                 notes.append(note("gyro_sign_changed", why))
-            return with_rate, one.kind, notes
-        why = f"the {one.kind} does not turn with the robot: rows with it are left out"
+            return with_rate, measured.kind, notes
+        why = f"the {measured.kind} does not turn with the robot: rows with it are left out"
         notes.append(note("gyro_not_used", why))
     if not notes:
         why = "the run holds no heading measured apart from the position: no rows with one"
@@ -272,13 +272,13 @@ def _rows(run: Run, found: HeldOut, kind: str, past: Recording) -> Iterator[Comp
         yield ComparedRow(public, partial(found.errors, name, 0), partial(found.path, name, 0))
     if found.has_gyro:
         (recording,) = found.recordings
-        for one in models_of(run):
+        for model in models_of(run):
             # Rows for comparison have the middle of the ICRs at the origin: with a measured turn each is no_slip_gyro.
-            if not row_of(one.name).compared:
-                of_past = one.name == "icr"
+            if not row_of(model.name).compared:
+                of_past = model.name == "icr"
                 lines = partial(past_gyro_lines, past.track) if of_past else partial(pooled.gyro_line, recording)
-                errors_of = partial(_errors_turned, run, recording, one.icrs, lines)
-                yield ComparedRow(f"{one.name}_{kind}", errors_of, knows=one.knows)
+                errors_of = partial(_errors_turned, run, recording, model.icrs, lines)
+                yield ComparedRow(f"{model.name}_{kind}", errors_of, knows=model.knows)
 
 
 def models_of(run: Run) -> tuple[Model, ...]:

@@ -164,7 +164,7 @@ def _derive(
     """Return the positions of antenna and ICRs, from the known one of both; by default the ICRs' middle is y = 0."""
     of_antenna_and_icrs = [direct[key] for key in (ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION)]
     (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, of_antenna_and_icrs)
-    of_ahead, of_aside, of_separation = (one.verdict for one in of_antenna_and_icrs)
+    of_ahead, of_aside, of_separation = (parameter.verdict for parameter in of_antenna_and_icrs)
     forward, right = known_antenna_m(run)
     if forward is not None:
         antenna_forward = _parameter(forward, 0.0, "given")

@@ -67,12 +67,12 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> documents.GroupCompar
     if len(groups) < 2:
         raise ConfigError("groups", "only one is given", "name two or more to compare")
     results = {name: calibrate_runs(runs) for name, runs in groups.items()}
-    recordings = {name: one.table.recordings for name, one in results.items()}
+    recordings = {name: result.table.recordings for name, result in results.items()}
     seen: dict[str, str] = {}
-    for name, one in ((name, one) for name, group in recordings.items() for one in group):
-        if one.sha256 and seen.setdefault(one.sha256, name) != name:
-            why = f"it is in {seen[one.sha256]} and in {name}"
-            raise ConfigError(one.name, why, "a calibration would be tested on what it was fitted to")
+    for name, recording in ((name, recording) for name, group in recordings.items() for recording in group):
+        if recording.sha256 and seen.setdefault(recording.sha256, name) != name:
+            why = f"it is in {seen[recording.sha256]} and in {name}"
+            raise ConfigError(recording.name, why, "a calibration would be tested on what it was fitted to")
     return compare_calibrations(results, recordings)
 
 
@@ -92,7 +92,10 @@ def compare_calibrations(
             if same_width and ours.robot.wheel_radius_m == theirs.robot.wheel_radius_m:
                 applied = _test(result, recordings[column], own=False)
             differences = _differences(held_out, applied, paired=True)
-            costs += [documents.TransferCost(*astuple(one), calibrated_on=row, tested_on=column) for one in differences]
+            costs += [
+                documents.TransferCost(*astuple(difference), calibrated_on=row, tested_on=column)
+                for difference in differences
+            ]
         for h, horizon in enumerate(TRANSFER_HORIZONS_M):
             errors, _ = _sum_up(applied.errors[:, h], applied.path, horizon)
             trials = int(np.count_nonzero(np.isfinite(applied.errors[:, h])))
@@ -105,14 +108,16 @@ def compare_calibrations(
         parameters = _parameter_differences(results[first].calibration, results[other].calibration)
         differences = _differences(tested[first, first], tested[other, other], paired=paired)
         at_choice = (first, other, CHOICE_HORIZON_M)
-        cost = next(one for one in costs if (one.calibrated_on, one.tested_on, one.horizon_m) == at_choice)
+        cost = next(cost for cost in costs if (cost.calibrated_on, cost.tested_on, cost.horizon_m) == at_choice)
         sentence = _verdict(first, other, parameters, cost)
-        errors_of_pair = tuple(documents.ErrorDifference(*astuple(one), paired=paired) for one in differences)
+        errors_of_pair = tuple(
+            documents.ErrorDifference(*astuple(difference), paired=paired) for difference in differences
+        )
         pairs.append(documents.ComparedPair(first, other, parameters, errors_of_pair, sentence))
     compared = {}
     for name, result in results.items():
-        one = result.calibration
-        compared[name] = documents.ComparedGroup(one.recommended, one.logs, one.geometry)
+        calibration = result.calibration
+        compared[name] = documents.ComparedGroup(calibration.recommended, calibration.logs, calibration.geometry)
     return documents.GroupComparison(
         schema=documents.COMPARE_SCHEMA, tool_version=__version__, groups=compared,
         pairs=tuple(pairs), transfer=tuple(cells), costs=tuple(costs),
@@ -123,9 +128,11 @@ def _verdict(
     first: str, second: str, parameters: Sequence[documents.ParameterDifference], cost: documents.TransferCost
 ) -> str:
     """Return one sentence: how the multiplier differs, and what the first calibration adds to the second's errors."""
-    one = next(one for one in parameters if one.quantity == "multiplier")
-    change = with_std(one.difference, one.std)
-    differs = f"Multiplier: {second} minus {first} is {change}{'' if one.significant else ', no difference shown'}"
+    multiplier = next(difference for difference in parameters if difference.quantity == "multiplier")
+    change = with_std(multiplier.difference, multiplier.std)
+    differs = (
+        f"Multiplier: {second} minus {first} is {change}{'' if multiplier.significant else ', no difference shown'}"
+    )
     if cost.p95_m is None:
         return f"{differs}."
     low, high = cost.p95_low_m, cost.p95_high_m
@@ -145,11 +152,13 @@ class _Tested(NamedTuple):
 def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bool) -> _Tested:
     """Return the errors of a calibration in recordings; `own`: each trial is predicted by a fit without it."""
     errors, path, before = [], [], 0.0
-    for i, one in enumerate(recordings):
-        trials = cut_trials(one, TRANSFER_HORIZONS_M)
-        intervals = result.table.errors(RECOMMENDED, i, trials) if own else predictor(result.calibration, one)(trials)
+    for i, recording in enumerate(recordings):
+        trials = cut_trials(recording, TRANSFER_HORIZONS_M)
+        intervals = (
+            result.table.errors(RECOMMENDED, i, trials) if own else predictor(result.calibration, recording)(trials)
+        )
         errors.append(intervals.position)
-        path.append(before + one.track.distance[trials.starts])
+        path.append(before + recording.track.distance[trials.starts])
         before = path[-1][-1]
     return _Tested(np.concatenate(errors), np.concatenate(path))
 
@@ -172,12 +181,12 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[docum
     differences = []
     same = np.array_equal(first.path, second.path)
     for h, horizon in enumerate(TRANSFER_HORIZONS_M):
-        sides = [one.errors[:, h] for one in (first, second)]
+        sides = [tested.errors[:, h] for tested in (first, second)]
         if same:
             both = np.isfinite(sides[0]) & np.isfinite(sides[1])
-            sides = [np.where(both, one, np.nan) for one in sides]
+            sides = [np.where(both, errors, np.nan) for errors in sides]
         (before, old), (after, new) = (
-            _sum_up(side, one.path, horizon) for side, one in zip(sides, (first, second), strict=True)
+            _sum_up(side, tested.path, horizon) for side, tested in zip(sides, (first, second), strict=True)
         )
         numbers: list[float | None] = []
         for metric, name in (("p95", "p95_m"), ("expected", "expected_m")):
@@ -191,12 +200,12 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[docum
 
 def same_route(first: Track, second: Track) -> bool:
     """Return whether two drives took the same route at the same distance."""
-    ends = [float(one.distance[-1]) for one in (first, second)]
+    ends = [float(track.distance[-1]) for track in (first, second)]
     if abs(ends[1] - ends[0]) > 0.05 * min(ends):
         return False
     at = np.arange(0.0, min(ends), 1.0)
-    places = [np.interp(at, one.distance, one.north) + 1j * np.interp(at, one.distance, one.east)
-              for one in (first, second)]  # fmt: skip
+    places = [np.interp(at, track.distance, track.north) + 1j * np.interp(at, track.distance, track.east)
+              for track in (first, second)]  # fmt: skip
     return bool(np.abs(places[1] - places[0]).max() < SAME_ROUTE_M)
 
 

@@ -159,7 +159,7 @@ def end_at_once() -> Iterator[None]:
         yield
         return
     # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
-    handled = [one for one in ENDING if signal.getsignal(one) is not signal.SIG_IGN]
+    handled = [ending for ending in ENDING if signal.getsignal(ending) is not signal.SIG_IGN]
     arrived, signalled = os.pipe()
     os.set_blocking(signalled, False)
     over = threading.Event()

@@ -122,7 +122,7 @@ def batch_command(
     printer.text(summary_of(rows, output, written))
     if calibrations:
         printer.text(f"\n{fleet_files.calibrations_text(calibrations)}".rstrip())
-    options.check_compared(one for row in rows for one in row.verdicts)
+    options.check_compared(verdict for row in rows for verdict in row.verdicts)
     missed = any(row.gates_failed for row in rows)
     if missed or any(row.status == "failed" for row in rows):
         raise SystemExit(3 if missed else 1)
@@ -142,7 +142,7 @@ def run_all(
 
     rows: list[FleetLog] = []
     with (
-        executor_of([one_log.path_from_bytes(one.path) for one in requests], *workers) as (executor, lost),
+        executor_of([one_log.path_from_bytes(request.path) for request in requests], *workers) as (executor, lost),
         view,
         closing(batches.run_batch(requests, executor, batch, view.stage, lost, folder)) as coming,
     ):
@@ -224,7 +224,7 @@ def line_of(row: FleetLog) -> str:
         parts.append(f"{row.distance_m:.0f} m")
     if not row.usable:
         # the first cause without its numbers; fleet.csv has the whole text
-        cause = next((one.finding for one in row.notes if notes.is_grave(one)), "")
+        cause = next((finding.finding for finding in row.notes if notes.is_grave(finding)), "")
         return "  ".join([*parts, f"do not use: {escaped(cause)}"])
     if row.multiplier is not None:
         parts.append(f"multiplier {row.multiplier:.3f} ± {row.multiplier_std or 0.0:.3f}")

@@ -118,12 +118,12 @@ def dropout_report_command(
     outcomes = [(str(source), (inputs.errors | reports)[str(source)]) for source in sources]
     exports.write(
         "dropout-report",
-        lambda: [acceptance.suite_of(*one) for one in outcomes],
+        lambda: [acceptance.suite_of(*outcome) for outcome in outcomes],
         lambda: acceptance.format_outcomes(outcomes),
     )
-    verdicts = [verdict for one in reports.values() for verdict in one.document.gates]
+    verdicts = [verdict for result in reports.values() for verdict in result.document.gates]
     options.check_compared(verdicts)
-    inputs.leave("runs and logs", gate_failed=not all(one.passed for one in verdicts))
+    inputs.leave("runs and logs", gate_failed=not all(verdict.passed for verdict in verdicts))
 
 
 def plan_sources(

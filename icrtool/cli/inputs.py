@@ -50,7 +50,7 @@ def runs_or_logs(place: Path) -> list[Path]:
         runs = sorted(file.parent for file in place.rglob(run_directory.RUN_FILE))
         if of_icrtool := [run for run in runs if run_directory.is_run_directory(run)]:
             return of_icrtool
-    return [one.path for one in recordings.find_recordings([place])]
+    return [recording.path for recording in recordings.find_recordings([place])]
 
 
 def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run]:
@@ -159,7 +159,7 @@ def _expanded(place: Path) -> list[Path]:
     if isinstance(place, UrlPath) or place.exists() or not glob.has_magic(str(place)):
         return [place]
     files = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute
-    return [Path(one) for one in files] or [place]
+    return [Path(file) for file in files] or [place]
 
 
 def named_place(source: str) -> tuple[LogText, Path]:
@@ -192,5 +192,10 @@ def grounds_of(sources: tuple[str, ...]) -> tuple[list[Path], list[str]]:
     if any(have_ground) and not all(have_ground):
         without = escaped(str(places[have_ground.index(False)][1]))
         raise errors.ConfigError(without, "has no name of a ground", "write NAME= before each argument, or before none")
-    of_grounds = [(str(name), one) for name, place in places for path in _expanded(place) for one in runs_or_logs(path)]
-    return [one for _, one in of_grounds], [name for name, _ in of_grounds] if all(have_ground) else []
+    of_grounds = [
+        (str(name), run_or_log)
+        for name, place in places
+        for path in _expanded(place)
+        for run_or_log in runs_or_logs(path)
+    ]
+    return [run_or_log for _, run_or_log in of_grounds], [name for name, _ in of_grounds] if all(have_ground) else []

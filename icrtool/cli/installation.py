@@ -100,7 +100,7 @@ def compile_all(*, quiet: bool) -> None:
         raise OutputError(cache_places()[0], "cannot be written", "set NUMBA_CACHE_DIR to a directory that can")
     call_all_kernels()
     if not quiet:
-        compiled = [bool(one.compiled) for one in all_kernels()]
+        compiled = [bool(kernel.compiled) for kernel in all_kernels()]
         click.echo(
             f"{sum(compiled)} of {len(compiled)} kernels compiled for {processor()[0]}, "
             f"in {time.perf_counter() - begin:.1f} s; kept in {place}"

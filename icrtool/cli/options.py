@@ -85,12 +85,16 @@ class GroupedCommand(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options of the help."""
-        declared = [one for one in self.get_params(ctx) if isinstance(one, click.Option)]
-        shown = [(one, found) for one in declared if (found := one.get_help_record(ctx)) is not None]
+        declared = [parameter for parameter in self.get_params(ctx) if isinstance(parameter, click.Option)]
+        shown = [
+            (shown_option, found)
+            for shown_option in declared
+            if (found := shown_option.get_help_record(ctx)) is not None
+        ]
         places = {f"--{name}": place for place, name in enumerate(USUAL)}
 
-        def place(one: click.Parameter) -> int | None:
-            return next((places[name] for name in one.opts if name in places), None)
+        def place(parameter: click.Parameter) -> int | None:
+            return next((places[name] for name in parameter.opts if name in places), None)
 
         usual = sorted((pair for pair in shown if place(pair[0]) is not None), key=lambda pair: place(pair[0]) or 0)
         rest = [pair for pair in shown if place(pair[0]) is None]
@@ -140,16 +144,18 @@ def options_as_record(name: str, home: str | Callable[..., Any], *options: Optio
     change : the argument is a function that returns a dataclass with the given options changed
     """
     bare = add_options(lambda: None, *options)
-    of_record = {one.name for one in bare.__dict__.get("__click_params__", ())}.union(bare.__dict__.get("made", ()))
+    of_record = {parameter.name for parameter in bare.__dict__.get("__click_params__", ())}.union(
+        bare.__dict__.get("made", ())
+    )
 
     def add(command: Command) -> Command:
         @wraps(command)
         def call(**arguments: Any) -> object:
             record = resolve_name(home) if isinstance(home, str) else home
             fields = {
-                one: arguments.pop(one) for one in of_record.intersection(signature(record).parameters, arguments)
+                field: arguments.pop(field) for field in of_record.intersection(signature(record).parameters, arguments)
             }
-            values = {one: value for one, value in fields.items() if value is not None}
+            values = {field: value for field, value in fields.items() if value is not None}
             record_or_change = (lambda old: replace(old, **values)) if change else record(**values)
             return command(**{name: record_or_change}, **arguments)
 
@@ -161,8 +167,8 @@ def options_as_record(name: str, home: str | Callable[..., Any], *options: Optio
 
 def add_options(command: Command, *options: Option) -> Command:
     """Add options to a command, in this order."""
-    for one in reversed(options):
-        command = one(command)
+    for add in reversed(options):
+        command = add(command)
     return command
 
 
@@ -237,8 +243,10 @@ def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str
     section, _, name = key.partition(".")
     if not equals:
         texts = config.key_texts()
-        keys = [(f"{one}.{two}", texts[one][two]["text"]) for one in config.SECTIONS for two in texts[one]]
-        return [CompletionItem(f"{one}=", help=text) for one, text in keys if one.startswith(incomplete)]
+        keys = [
+            (f"{section}.{two}", texts[section][two]["text"]) for section in config.SECTIONS for two in texts[section]
+        ]
+        return [CompletionItem(f"{name}=", help=text) for name, text in keys if name.startswith(incomplete)]
     if section == "topics":
         # click leaves the words before an incomplete --set in `args`.
         values = topics_of(ctx.params.get("logs") or ctx.params.get("sources") or ctx.args)
@@ -261,7 +269,9 @@ def topics_of(logs: object) -> tuple[str, ...]:
             container = open_log.open_log(Path(log))
         except errors.IcrToolError:
             continue
-        topics |= {str(one.topic) for one in container.channels if re.fullmatch(r"[\w/~.-]+", one.topic, re.ASCII)}
+        topics |= {
+            str(channel.topic) for channel in container.channels if re.fullmatch(r"[\w/~.-]+", channel.topic, re.ASCII)
+        }
         container.close()
     return tuple(sorted(topics))
 
@@ -372,7 +382,7 @@ ALLOW_UNUSABLE = flag("--allow-unusable", "Give distances and numbers of runs th
 
 def _split_gates(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:
     """Return the limits in the lines of each text. A blank text is kept, and is refused later as an invalid limit."""
-    lines = tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
+    lines = tuple(line for gate in gates for line in [line for line in gate.splitlines() if line.strip()] or [gate])
     for line in lines:
         try:
             model = report.parse_gate(line).model
@@ -452,7 +462,7 @@ def names_baseline(gate: str) -> bool:
 
 def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
     """Refuse a baseline without any of the logs, because a gate that is never checked would always pass."""
-    relative = [bool(one.not_checked) for one in verdicts if one.relative]
+    relative = [bool(verdict.not_checked) for verdict in verdicts if verdict.relative]
     if relative and all(relative):
         advice = "logs are matched by content, else by name"
         raise errors.ConfigError("--baseline", "none of these logs is in it", advice)
@@ -460,6 +470,10 @@ def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
 
 def options_to_repeat(settings: ConfigSources, request: FitRequest) -> list[str]:
     """Return the options of this call that the proposed next command needs too."""
-    pairs = [("--config", settings.file), ("--robot", settings.robot), *(("--set", one) for one in settings.sets)]
+    pairs = [
+        ("--config", settings.file),
+        ("--robot", settings.robot),
+        *(("--set", setting) for setting in settings.sets),
+    ]
     pairs += [("--from", request.start), ("--to", request.end)]
     return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]

@@ -164,7 +164,7 @@ class Printer(NamedTuple):
             self.warn(run.warnings if self.verbose or self.as_json or not sys.stderr.isatty() else ())
         elif not sys.stderr.isatty():
             gravest = notes.gravest(run.notes)
-            self.warn(one.sentence for one in gravest[:most])
+            self.warn(finding.sentence for finding in gravest[:most])
             if len(gravest) > most and not self.quiet:
                 click.echo(f"{counted(len(gravest) - most, 'more warning')}: -v, or run.json", err=True)
         if self.verbose:

@@ -210,7 +210,10 @@ def compare_command(
     """  # noqa: D301 - click reads the escape
     config = settings.load()
     calibrations = [
-        (name, one) for name, places in groups_of(sources).items() for path in places for one in runs_or_logs(path)
+        (name, run_or_log)
+        for name, places in groups_of(sources).items()
+        for path in places
+        for run_or_log in runs_or_logs(path)
     ]
     groups: dict[str, list[Run]] = {}
     runs = runs_named([path for _, path in calibrations], config, printer)

@@ -279,7 +279,7 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
         f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {seed}",
         f"ICRs   y right {right:+z.3f}, y left {left:+z.3f}, x {x:+z.3f} m{', mean' if plan.robot else ''}",
     ]
-    lines += [f"       from {time:g} s on {', '.join(f'{one:+z.3f}' for one in icrs)} m" for time, icrs in plan.changes]
+    lines += [f"       from {time:g} s on {', '.join(f'{icr:+z.3f}' for icr in icrs)} m" for time, icrs in plan.changes]
     return "\n".join(lines)
 
 
@@ -375,7 +375,7 @@ def check_varied(study: Study, name: str, arguments: Mapping[str, object]) -> No
     arguments : the options by name
     """
     if arguments.get(study.varied) is not None:
-        option = next(one.opts[0] for one in study_command.params if one.name == study.varied)
+        option = next(parameter.opts[0] for parameter in study_command.params if parameter.name == study.varied)
         raise click.UsageError(f"{option} is what study {name} varies; --values V,V,... sets where")
     if arguments["values"] is not None and not study.varies:
         raise click.UsageError(f"study {name} varies no number; it takes no --values")

@@ -235,7 +235,7 @@ def report_on(
         cost = measure_errors(crossed, horizons_m, starts=request.starts, seed=request.seed)
     by_start = shown_paths.errors_by_start(compared, compared_models, starts=request.starts)
     budgets_m = () if unusable else request.budgets_m
-    budgets = [one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)]
+    budgets = [reach for budget_m in budgets_m for reach in report.budget_distances(errors, budget_m)]
     return _report(
         compared, errors, request,
         with_events=cost,
@@ -403,7 +403,7 @@ def _report(
     notes = (*run.notes, *(() if compared_models is None else compared_models.notes), *notes)
     event_cost = None
     if with_events is not None:
-        all_rows = {one.name: one.document.by_horizon for one in with_events.results}
+        all_rows = {result.name: result.document.by_horizon for result in with_events.results}
         numbers = {
             name: [documents.ErrorRow(*astuple(row)[:ERROR_FIELDS]) for row in rows] for name, rows in all_rows.items()
         }
@@ -432,7 +432,7 @@ def _report(
             seed=request.seed,
             next_level=NEXT_LEVEL,
         ),
-        models=tuple(one.document for one in errors.results),
+        models=tuple(result.document for result in errors.results),
         trials=tuple(_counts(errors, with_events)),
         reference_error=errors.reference,
         by_learning=errors.by_learning,
@@ -444,11 +444,11 @@ def _report(
         by_turning=by_turning,
         ladder=_ladder(errors, calibrations, compared_models, left_out),
         gates=gates,
-        passed=all(one.passed for one in gates),
+        passed=all(verdict.passed for verdict in gates),
         baseline=earlier,
-        outages=tuple(one.document for one in outages),
-        worst=tuple(one.document for one in worst),
-        examples=tuple(one.document for one in examples),
+        outages=tuple(outage.document for outage in outages),
+        worst=tuple(trial.document for trial in worst),
+        examples=tuple(trial.document for trial in examples),
     )
     return report.DropoutReport(
         **{field.name: getattr(errors, field.name) for field in fields(errors)}, document=document,
@@ -491,15 +491,17 @@ def _ladder(
     """Return how the models were compared, or why the comparison was left out."""
     if compared_models is None:
         return documents.LadderDocument(left_out=why_none)
-    of_calibrations, turned = {one.name for one in calibrations}, f"_{compared_models.heading}"
+    of_calibrations, turned = {used.name for used in calibrations}, f"_{compared_models.heading}"
     models = []
-    for one in errors.results:
-        if one.name not in of_calibrations and kind_of(one.name) != TOPIC_ROW:
-            with_heading = bool(compared_models.heading) and one.name.endswith(turned)
-            rows = [astuple(row)[1:ERROR_FIELDS] for row in one.document.by_horizon]
+    for result in errors.results:
+        if result.name not in of_calibrations and kind_of(result.name) != TOPIC_ROW:
+            with_heading = bool(compared_models.heading) and result.name.endswith(turned)
+            rows = [astuple(row)[1:ERROR_FIELDS] for row in result.document.by_horizon]
             heading = compared_models.heading if with_heading else "wheels"
             models.append(
-                documents.ScoreDocument(one.name, one.document.knows, heading, *map(list, zip(*rows, strict=True)))
+                documents.ScoreDocument(
+                    result.name, result.document.knows, heading, *map(list, zip(*rows, strict=True))
+                )
             )
     table, fits = compared_models.table, {}
     for name, fit in table.fits.items():
@@ -527,22 +529,22 @@ def with_other_grounds(
 ) -> tuple[BudgetDistance, ...]:
     """Return the distances within budgets; rows of calibrations also get their interval on another ground."""
     scores = {
-        one.name: one.calibration.other_grounds or ()
-        for one in calibrations
-        if one.calibration is not None and not one.fitted_to_this
+        used.name: used.calibration.other_grounds or ()
+        for used in calibrations
+        if used.calibration is not None and not used.fitted_to_this
     }
     # row ``adaptive`` begins with the first calibration that was not fitted to this log
     first = next(iter(scores.values()), ())
     distances = []
-    for one in budgets:
-        by, kind = turned_by(one.model), kind_of(one.model)
+    for reach in budgets:
+        by, kind = turned_by(reach.model), kind_of(reach.model)
         row = f"{RECOMMENDED if kind == 'calibration' else kind}{f'_{by}' if by else ''}"
-        of_row = {"calibration": scores.get(one.model, ()), "adaptive": first}.get(kind, ())
-        ends = other_ground_ends(of_row, row, one.budget_m)
+        of_row = {"calibration": scores.get(reach.model, ()), "adaptive": first}.get(kind, ())
+        ends = other_ground_ends(of_row, row, reach.budget_m)
         if ends is None:
-            distances.append(one)
+            distances.append(reach)
         else:
-            distances.append(msgspec.structs.replace(one, other_low_m=ends[0], other_high_m=ends[1]))
+            distances.append(msgspec.structs.replace(reach, other_low_m=ends[0], other_high_m=ends[1]))
     return tuple(distances)
 
 
@@ -558,30 +560,32 @@ def _calibration_rows(
         return (), [], []
     recording = turning_recording_of(run)
     driven = with_poses_of(recording, past)
-    for number, one in enumerate(calibrations, start=1):
+    for number, calibration in enumerate(calibrations, start=1):
         name = "calibration"
         if len(calibrations) > 1:
-            stem = one.name or str(number)
-            if one.name and sum(other.name == one.name for other in calibrations) > 1:
+            stem = calibration.name or str(number)
+            if calibration.name and sum(other.name == calibration.name for other in calibrations) > 1:
                 stem = f"{stem}-{number}"
             name = f"calibration:{stem}"
-        created = one.created or ""
+        created = calibration.created or ""
         of_sensors = dict.fromkeys(CalibrationFile.__struct_fields__[1:], UNSET)
-        short_record = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
-        fitted_to_this = one.fitted_to(recording.sha256)
+        short_record = msgspec.structs.replace(calibration, models={}, held_out=(), name=UNSET, **of_sensors)
+        fitted_to_this = calibration.fitted_to(recording.sha256)
         fitted = "fitted to this log" if fitted_to_this else "not fitted to this log"
         refitted = "; sensors refitted" if request.refit_sensors else ""
-        rows = [(name, one.recommended, False)]
-        if one.gyro is not None and recording.track.gyro is not None:
-            rows.append((f"{name}_gyro", one.gyro.model, True))
+        rows = [(name, calibration.recommended, False)]
+        if calibration.gyro is not None and recording.track.gyro is not None:
+            rows.append((f"{name}_gyro", calibration.gyro.model, True))
         for row, model, with_gyro in rows:
             tested = calibrated_drive(
-                one, recording, row, driven, with_gyro=with_gyro, refit_sensors=request.refit_sensors
+                calibration, recording, row, driven, with_gyro=with_gyro, refit_sensors=request.refit_sensors
             )
             models.append(ComparedRow(row, tested.drive.errors, knows=f"other logs ({fitted}); {tested.knows}"))
             notes += tested.notes
             words = f"{fitted}{refitted}", tested.sensors
             used.append(
-                UsedCalibration(row, model, len(one.logs), fitted_to_this, created, with_gyro, short_record, *words)
+                UsedCalibration(
+                    row, model, len(calibration.logs), fitted_to_this, created, with_gyro, short_record, *words
+                )
             )
     return tuple(used), models, notes

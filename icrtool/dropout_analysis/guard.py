@@ -38,7 +38,7 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
     Rows are compared at the horizon nearest to `CHOICE_HORIZON_M` at which each has `FEWEST_TRIALS`. Starts of trials
     of held-out rows are up to `LONGEST_RECORDING_STEP_S` apart, at most `MOST_TRIALS` of a drive.
     """
-    rows = {one.name: one.document.by_horizon for one in errors.results}
+    rows = {result.name: result.document.by_horizon for result in errors.results}
     names = [name for name in held_out if name in rows]
     if not names:
         return None

@@ -130,7 +130,7 @@ class DropoutReport(OpenLoopErrors):
         """The rows of summary.csv as a DataFrame."""
         import pandas as pd
 
-        rows = [{"model": one.name} | asdict(row) for one in self.document.models for row in one.by_horizon]
+        rows = [{"model": model.name} | asdict(row) for model in self.document.models for row in model.by_horizon]
         types = dict.fromkeys(documents.SummaryRow.__struct_fields__, "float64") | {"trials": "int64"}
         return pd.DataFrame(rows, columns=["model", *types]).astype(types)
 
@@ -190,7 +190,7 @@ class BaselineReport:
     @property
     def sha256(self) -> tuple[str, ...]:
         """SHA-256 of each file of the log; empty where the SHA-256 of one file is not known."""
-        return known_content(one.sha256 for one in self.document.run.inputs)
+        return known_content(file.sha256 for file in self.document.run.inputs)
 
     @property
     def tool_version(self) -> str:
@@ -199,10 +199,10 @@ class BaselineReport:
 
     def at(self, model: str, horizon_m: float) -> tuple[documents.ErrorRow | None, BlockSums | None]:
         """Return the numbers of a model at a horizon, and their block sums; None where the report has none."""
-        for one in self.document.models:
-            for row in one.by_horizon:
-                if one.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6):
-                    sums_there = next((sums for sums in one.blocks if sums.horizon_m == row.horizon_m), None)
+        for result in self.document.models:
+            for row in result.by_horizon:
+                if result.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6):
+                    sums_there = next((sums for sums in result.blocks if sums.horizon_m == row.horizon_m), None)
                     if sums_there is None:
                         return row, None
                     counts = (
@@ -232,7 +232,7 @@ class BaselineReport:
                 what = f"no {gate.model} over {gate.horizon_m:g} m in the baseline {self.path}"
                 raise ConfigError(f"gate {gate.text!r}", what, "make the baseline again")
             return float(documents.column_of([row], METRICS[gate.metric])[0]), sums
-        rows = [row for one in self.document.models if one.name == gate.model for row in one.by_horizon]
+        rows = [row for result in self.document.models if result.name == gate.model for row in result.by_horizon]
         if not rows:
             raise ConfigError(f"gate {gate.text!r}", f"no {gate.model} in the baseline {self.path}", "make it again")
         rows.sort(key=lambda row: row.horizon_m)
@@ -309,8 +309,8 @@ def pooled_baseline(drives: Sequence[documents.DropoutDocument], log: str, path:
         rows = []
         for row in model.by_horizon:
             numbers = {name: _numbers_of(drives, model.name, row.horizon_m, name) for name in _ERROR_COLUMNS}
-            means = {name: float(np.exp(np.log(_positive(one)).mean())) for name, one in numbers.items()
-                     if len(_positive(one))}  # fmt: skip
+            means = {name: float(np.exp(np.log(_positive(values)).mean())) for name, values in numbers.items()
+                     if len(_positive(values))}  # fmt: skip
             rows.append(replace(row, **{name: means.get(name) for name in _ERROR_COLUMNS}))
         models.append(replace(model, by_horizon=rows, blocks=[]))
     return BaselineReport(log, path, replace(first, models=models), tuple(drives))
@@ -324,9 +324,9 @@ def _numbers_of(drives: Sequence[documents.DropoutDocument], model: str, horizon
     rows = [
         row
         for drive in drives
-        for one in drive.models
-        for row in one.by_horizon
-        if one.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6)
+        for result in drive.models
+        for row in result.by_horizon
+        if result.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6)
     ]
     column = documents.column_of(rows, name)
     return np.asarray(column[np.isfinite(column)])
@@ -389,12 +389,16 @@ def best_row(
     difference, and the intervals of both expected errors overlap. The difference alone is not enough: where all turns
     of a drive lie in one block, its interval is wider than any error.
     """
-    own = {one.name for one in calibrations if one.fitted_to_this}
+    own = {used.name for used in calibrations if used.fitted_to_this}
     # A localisation in the log uses further sensors.
-    own |= {one.name for one in errors.results if kind_of(one.name) == TOPIC_ROW}
-    rows = {one.name: row_of(one.name) for one in errors.results if not turned_by(one.name) and one.name not in own}
-    results = {one.name: one for one in errors.results if one.name in rows and rows[one.name].on_robot}
-    means = {name: one.column("expected_error_m") for name, one in results.items()}
+    own |= {result.name for result in errors.results if kind_of(result.name) == TOPIC_ROW}
+    rows = {
+        result.name: row_of(result.name)
+        for result in errors.results
+        if not turned_by(result.name) and result.name not in own
+    }
+    results = {result.name: result for result in errors.results if result.name in rows and rows[result.name].on_robot}
+    means = {name: result.column("expected_error_m") for name, result in results.items()}
     driven = {name: mean for name, mean in means.items() if not rows[name].compared and np.isfinite(mean).any()}
     if not driven:
         return None
@@ -488,7 +492,7 @@ def check_gate(
         A model or horizon that the report, or the baseline, does not have.
     """
     if (result := report.result(gate.model)) is None:
-        choices = ", ".join(one.name for one in report.results)
+        choices = ", ".join(result.name for result in report.results)
         advice = f"this run has {choices}; no_slip needs robot.track_width_m"
         raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
     sums = None

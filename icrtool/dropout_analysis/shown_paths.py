@@ -148,7 +148,9 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     examples = []
     for group in (moving[off <= off.min() + ALIKE_RAD], straight):
         sample = group[:: -(-len(group) // TYPICAL_OF)]
-        errors = [open_loop_errors(track, models[0].icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
+        errors = [
+            open_loop_errors(track, models[0].icrs, ends[start : start + 1, None], start)[0, 0] for start in sample
+        ]
         start = int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
         examples.append(_example(run, track, models, (), models[0].name, start, int(ends[start]), horizon_m))
     return tuple(examples)
@@ -312,7 +314,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         error = finite_or_none(float(np.hypot(north.mean(), east.mean())))
         inside = slice(last - first + 1)
         driven_m = float(table.distance_m[last] - table.distance_m[first])
-        begin_s, end_s = ((int(one) - origin) / 1e9 for one in (begin, end))
+        begin_s, end_s = ((int(stamp_ns) - origin) / 1e9 for stamp_ns in (begin, end))
         document = OutageDocument("real", begin_s, end_s, driven_m, error, error)
         outages.append(Outage(document, path.north[inside], path.east[inside]))
     return tuple(outages)

@@ -128,19 +128,19 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
     # Ratios of measured to assumed variance of fixes and headings; at least 1.
     position = max((noise.nis_gnss_mean or 0.0) / GNSS_NIS, 1.0)
     heading = max((noise.nis_heading_mean or 0.0) / HEADING_NIS, 1.0)
-    every = [one for group in trials for one in group]
+    every = [trial for group in trials for trial in group]
 
     def at_ends(column: Floats) -> list[tuple[Floats, Floats]]:
-        return [(column[one.start], column[one.end]) for one in every]
+        return [(column[trial.start], column[trial.end]) for trial in every]
 
     # columns are read one after the other: a run that was read back may not hold them in memory
     stds = at_ends(table.std_north_m), at_ends(table.std_east_m), at_ends(table.std_heading_rad)
     generators = (rng for group in trials for rng in repeat(np.random.default_rng(seed), len(group)))
     rows = []
-    for one, rng, of_north, of_east, (of_heading, _) in zip(every, generators, *stds, strict=True):
-        start, end = one.start, one.end
+    for trial, rng, of_north, of_east, (of_heading, _) in zip(every, generators, *stds, strict=True):
+        start, end = trial.start, trial.end
         if not len(start):
-            rows.append(ReferenceRow(one.horizon_m, None, None, None))
+            rows.append(ReferenceRow(trial.horizon_m, None, None, None))
             continue
         north, east = table.north_m[end] - table.north_m[start], table.east_m[end] - table.east_m[start]
         north_std, east_std = ([np.sqrt(position) * std for std in of_both] for of_both in (of_north, of_east))
@@ -153,7 +153,7 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
         square = sum(std**2 for std in (*north_std, *east_std))
         square = square + std_heading**2 * (north**2 + east**2)
         of_error = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
-        rows.append(ReferenceRow(one.horizon_m, *(finite_or_none(float(number)) for number in of_error)))
+        rows.append(ReferenceRow(trial.horizon_m, *(finite_or_none(float(number)) for number in of_error)))
     return tuple(rows)
 
 

@@ -165,9 +165,9 @@ def _departure(place: Complexes, reference: Complexes, distance: Floats) -> Depa
     parts = np.searchsorted(distance, distance[0] + (distance[-1] - distance[0]) * np.arange(1, PIECES) / PIECES)
     whole = _misfit(place, reference)
     pieces = [
-        _misfit(one, other)
-        for one, other in zip(np.split(place, parts), np.split(reference, parts), strict=True)
-        if len(one) >= FEWEST_COMPARED // PIECES
+        _misfit(part, other)
+        for part, other in zip(np.split(place, parts), np.split(reference, parts), strict=True)
+        if len(part) >= FEWEST_COMPARED // PIECES
     ]
     if len(pieces) < PIECES or not min(pieces) > 0.0:
         return None

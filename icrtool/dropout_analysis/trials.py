@@ -163,7 +163,9 @@ def _by_learning(
     """Return the errors of trials before and after the state in which the ICRs were learned; None without row icr."""
     if not before:
         return None
-    at_s, driven_m = (None if learned is None else float(one[learned]) for one in (run.table.t_s, run.table.distance_m))
+    at_s, driven_m = (
+        None if learned is None else float(column[learned]) for column in (run.table.t_s, run.table.distance_m)
+    )
     return documents.LearnedDocument("icr", at_s, driven_m, before, after)
 
 
@@ -184,13 +186,13 @@ class _Started(NamedTuple):
     @classmethod
     def of(cls, run: Run, track: Track, horizons_m: Floats, ends: Rows) -> _Started:
         """Return the trials that start at all states; `ends` (h, n) are the states at which they end."""
-        blocks = _blocks(track.distance, horizons_m, (one >= 0 for one in ends))
+        blocks = _blocks(track.distance, horizons_m, (column >= 0 for column in ends))
         return cls(track.distance, blocks, _slipping_trials(run, ends))
 
     def at(self, starts: Ints, horizons_m: Floats, errors: Floats) -> _Started:
         """Return the trials at some starts (k,), which have errors (k, h)."""
         path_m = self.path_m[starts]
-        slipping = [None if one is None else one[starts] for one in self.slipping]
+        slipping = [None if touches is None else touches[starts] for touches in self.slipping]
         return _Started(path_m, _blocks(path_m, horizons_m, np.isfinite(errors.T)), slipping)
 
 
@@ -301,7 +303,10 @@ def _row(metres: float, errors: Floats) -> documents.ErrorRow:
 
 def _blocks(path_m: Floats, horizons: Floats, tried: Iterable[Bools]) -> list[statistics.Blocks | None]:
     """Return the blocks of path of each horizon; `tried` (n,) of each marks the starts with a trial."""
-    return [statistics.cut_blocks(one, path_m, metres) for one, metres in zip(tried, horizons.tolist(), strict=True)]
+    return [
+        statistics.cut_blocks(has_trial, path_m, metres)
+        for has_trial, metres in zip(tried, horizons.tolist(), strict=True)
+    ]
 
 
 def _errors(track: Track, model: Model, ends: Rows, pool: Executor) -> Floats:
@@ -357,11 +362,11 @@ def _result(model: Model | ComparedRow, by_horizon: Iterable[_AtHorizon]) -> doc
     """Return the result of one model from its statistics at each horizon."""
     rows, bins, sums, free, aligned = zip(*by_horizon, strict=True)
     blocks = []
-    for row, one in zip(rows, sums, strict=True):
-        if one is not None:
-            errors_m = [float(f"{error:.6g}") for error in one.errors_m]
+    for row, sums_of_row in zip(rows, sums, strict=True):
+        if sums_of_row is not None:
+            errors_m = [float(f"{error:.6g}") for error in sums_of_row.errors_m]
             blocks.append(
-                documents.BlocksDocument(row.horizon_m, **plain_value(one._asdict() | {"errors_m": errors_m}))
+                documents.BlocksDocument(row.horizon_m, **plain_value(sums_of_row._asdict() | {"errors_m": errors_m}))
             )
     of_name = row_of(model.name)
     document = documents.ModelDocument(model.name, of_name.words, model.knows or of_name.knows, list(rows), blocks)

@@ -330,8 +330,8 @@ def _samples_that_err_alike(sensors: SensorData, noise: ProcessNoise) -> float:
     tau_s, stamps = sensors.facts.heading_correlation_s, sensors.headings.stamp_ns
     if sensors.facts.headings_are_precise:
         density, usual = (
-            math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
-            for one in (noise, FIELD.process_noise)
+            math.radians(process.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
+            for process in (noise, FIELD.process_noise)
         )
         variance = float(np.median(sensors.headings.var_rad2))
         tau_s = max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))

@@ -110,21 +110,21 @@ def followed_jumps(
 
     # between the jumps of one rejection the filter does not follow the reference
     spans = [
-        settled(one)
-        for one in _joined([followed(jump) for jump in sensors.jumps], -1)
+        settled(jump)
+        for jump in _joined([followed(jump) for jump in sensors.jumps], -1)
         # steps that cancel each other are no jump
-        if one.kind == "heading" or math.hypot(one.moved_north_m, one.moved_east_m) >= BRIDGED * one.size_m
+        if jump.kind == "heading" or math.hypot(jump.moved_north_m, jump.moved_east_m) >= BRIDGED * jump.size_m
     ]
     # a decided jump includes the undecided jumps around it
-    decided = _joined([one for one in spans if not one.undecided], SAME_JUMP_NS)
-    begins, free = [one.begin_ns for one in decided], []
-    for one in spans:
-        row = bisect_right(begins, one.begin_ns)
+    decided = _joined([jump for jump in spans if not jump.undecided], SAME_JUMP_NS)
+    begins, free = [jump.begin_ns for jump in decided], []
+    for jump in spans:
+        row = bisect_right(begins, jump.begin_ns)
         before, after = decided[max(row - 1, 0) : row], decided[row : row + 1]
-        joins = any(one.begin_ns <= other.end_ns + SAME_JUMP_NS for other in before)
-        joined = any(other.begin_ns <= one.end_ns + SAME_JUMP_NS for other in after)
-        if one.undecided and not joins and not joined:
-            free.append(one)
+        joins = any(jump.begin_ns <= other.end_ns + SAME_JUMP_NS for other in before)
+        joined = any(other.begin_ns <= jump.end_ns + SAME_JUMP_NS for other in after)
+        if jump.undecided and not joins and not joined:
+            free.append(jump)
     return tuple(sorted((*decided, *_joined(free, SAME_JUMP_NS)), key=attrgetter("begin_ns")))
 
 
@@ -141,7 +141,7 @@ def _joined(jumps: list[ReferenceJump], near_ns: int) -> list[ReferenceJump]:
             joined.append(jump)
             continue
         before = joined[-1]
-        larger = max(before, jump, key=lambda one: (not one.undecided, one.size_m))
+        larger = max(before, jump, key=lambda jump: (not jump.undecided, jump.size_m))
         joined[-1] = msgspec.structs.replace(
             larger,
             begin_ns=before.begin_ns,

@@ -110,7 +110,7 @@ def _pieces(table: States, in_gap: Bools, icrs: FrozenIcrs) -> Iterator[tuple[sl
             step_north, step_east = north - float(track.north[first - 1]), east - float(track.east[first - 1])
             miss_north += step_north * cos - step_east * sin - step_north
             miss_east += step_north * sin + step_east * cos - step_east
-        path = OpenLoopPath(*(np.array([one]) for one in (north, east, psi)))
+        path = OpenLoopPath(*(np.array([value]) for value in (north, east, psi)))
         for rows, piece in chain([(slice(first, first + 1), path)], open_loop_pieces(track, icrs, first, last)):
             ahead_north, ahead_east = piece.north - north, piece.east - east
             path = OpenLoopPath(
@@ -120,7 +120,8 @@ def _pieces(table: States, in_gap: Bools, icrs: FrozenIcrs) -> Iterator[tuple[sl
             )
             yield rows, path
         miss_north, miss_east = (
-            float(one[-1] - reference[last]) for one, reference in ((path.north, track.north), (path.east, track.east))
+            float(column[-1] - reference[last])
+            for column, reference in ((path.north, track.north), (path.east, track.east))
         )
         turned = float(path.heading[-1] - track.heading[last])
 

@@ -138,7 +138,7 @@ def _check_motion(sensors: SensorData) -> None:
     if max(travelled) >= LEAST_WHEEL_TRAVEL_M:
         return
     # a few fixes may be wrong
-    north, east = (float(np.subtract(*np.percentile(one, [95, 5]))) for one in (fixes.north_m, fixes.east_m))
+    north, east = (float(np.subtract(*np.percentile(column, [95, 5]))) for column in (fixes.north_m, fixes.east_m))
     moved, noise_m = math.hypot(north, east), float(np.sqrt(np.median(fixes.var_north_m2 + fixes.var_east_m2)))
     if moved > max(LEAST_WHEEL_TRAVEL_M, FAR_IN_SIGMAS * noise_m):
         why = f"the wheels never turn ({max(travelled):.2f} m), yet the position moves by {moved:.1f} m"
@@ -201,8 +201,8 @@ def run_adaptively(
     ``field`` only; configured noise is not searched for.
     """
 
-    def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterParameters, FilterOutput]:
-        setup = set_up_filter(one, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
+    def run(streams: SensorData, noise: ProcessNoise) -> tuple[FilterParameters, FilterOutput]:
+        setup = set_up_filter(streams, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
         return setup.parameters, run_ekf(*setup)
 
     noise, settings = configured_noise(config), config.filter
@@ -215,7 +215,7 @@ def run_adaptively(
         np.minimum(output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]], parameters.gnss_gate) / 2.0,
         np.minimum(output.heading_nis[(output.heading_code > UNSEEN) & moving[1]], parameters.heading_gate),
     )
-    if all(not len(one) or one.mean() <= TOLERATED_NIS for one in nis):
+    if all(not len(values) or values.mean() <= TOLERATED_NIS for values in nis):
         return parameters, output, noise
     del output, nis  # frees memory for the next run
     wander_rad, largest = sensors.facts.turn_wander_rad, LARGEST_HEADING_DEGPS
@@ -277,7 +277,7 @@ def find_noise(
             if last > 0.0:
                 tried = [best._replace(**{name: value}) for value in steps]
                 limit = min(map(cost_of, tried)) + LIKE_COST
-                best = next(one for one in tried if cost_of(one) <= limit)
+                best = next(noise for noise in tried if cost_of(noise) <= limit)
         if best == before:
             break
     return best

@@ -124,9 +124,9 @@ def summarise(
             applied_delay_s=lag.applied, used=_count(filtered.heading.used), rejected=_count(filtered.heading.rejected),
         ),
         wheels=measurements.wheels,
-        events=tuple(EventDocument(**(asdict(one) | _seconds(one, start_ns))) for one in sensors.events),
+        events=tuple(EventDocument(**(asdict(event) | _seconds(event, start_ns))) for event in sensors.events),
         reference_jumps=tuple(
-            ReferenceJumpDocument(**(asdict(one) | _seconds(one, start_ns))) for one in sensors.jumps
+            ReferenceJumpDocument(**(asdict(jump) | _seconds(jump, start_ns))) for jump in sensors.jumps
         ),
         outages_ns=_spans(filtered.outages_ns),
         rtk_losses_ns=_spans(sensors.losses_ns),
@@ -300,7 +300,7 @@ def icr_summary(
         return NumberByIcr(*(None if column in hidden else finite_or_none(value) for column, value in rows))
 
     settled_icrs = (getattr(table, column)[after] for column in ICR_COLUMNS)
-    means, stds = zip(*((float(one.mean()), float(one.std())) for one in settled_icrs), strict=True)
+    means, stds = zip(*((float(icr.mean()), float(icr.std())) for icr in settled_icrs), strict=True)
     if multiplier is None or {"y_icr_right_m", "y_icr_left_m"} & set(hidden):
         apart, apart_std = None, None
     else:
@@ -326,8 +326,8 @@ def segment_summary(table: States, changes_s: tuple[float, ...]) -> tuple[Segmen
         inside = (table.t_s >= (begin + end) / 2) & (table.t_s <= end)
         icrs: list[Floats] = [getattr(table, column)[inside] for column in ICR_COLUMNS]
         means, stds = (
-            [_mean(one) for one in icrs],
-            [finite_or_none(float(one.std())) if len(one) else None for one in icrs],
+            [_mean(icr) for icr in icrs],
+            [finite_or_none(float(icr.std())) if len(icr) else None for icr in icrs],
         )
         segments.append(SegmentDocument(begin, end, NumberByIcr(*means), NumberByIcr(*stds)))
     return tuple(segments)

@@ -101,8 +101,8 @@ class _Arguments:
             self.forms += _ARRAY_FORM + (_INTEGER,) * (2 * value.ndim)
         elif isinstance(value, tuple):
             self.types.append((type(value).__qualname__, len(value)))
-            for one in value:
-                self._add(one)
+            for item in value:
+                self._add(item)
         else:
             plain: Any = value.item() if isinstance(value, np.generic) else value
             name = type(plain).__name__
@@ -267,17 +267,21 @@ def machine_code(function: Callable[..., Any], values: Sequence[object], forms: 
 def _machine_code(function: Callable[..., Any], values: Sequence[object], forms: Sequence[Any]) -> MachineCode | None:
     numba = _numba()
     dispatcher = numba.njit(**_BARE)(function)
-    dispatcher.compile(tuple(numba.typeof(_writable(one)) for one in values))
+    dispatcher.compile(tuple(numba.typeof(_writable(value)) for value in values))
     [signature] = dispatcher.nopython_signatures
     module, result = llvm.parse_assembly(dispatcher.inspect_llvm(signature.args)), signature.return_type
-    called = {one.name for one in module.functions if one.is_declaration and not one.name.startswith("llvm.")}
+    called = {
+        declared.name
+        for declared in module.functions
+        if declared.is_declaration and not declared.name.startswith("llvm.")
+    }
     # A version of numba that passes arguments in another form has no such function.
     expected = [_LLVM_TYPES[form] for form in [_POINTER, _POINTER, *forms]]
     entries = [
-        one.name
-        for one in module.functions
-        if not one.is_declaration
-        and ["ptr" if word.type.is_pointer else str(word.type) for word in one.arguments] == expected
+        defined.name
+        for defined in module.functions
+        if not defined.is_declaration
+        and ["ptr" if word.type.is_pointer else str(word.type) for word in defined.arguments] == expected
     ]
     returned = str(numba.types.unliteral(result))
     if not called <= _MATHEMATICS or len(entries) != 1 or returned not in _RESULTS:
@@ -375,7 +379,7 @@ def _writable(value: object) -> object:
     if isinstance(value, np.ndarray):
         return np.empty((0,) * value.ndim, value.dtype)
     if isinstance(value, tuple):
-        made = tuple(_writable(one) for one in value)
+        made = tuple(_writable(item) for item in value)
         return value._make(made) if hasattr(value, "_make") else made
     return value.item() if isinstance(value, np.generic) else value
 

@@ -265,7 +265,7 @@ def error_intervals(
     of_length = spread.horizon_std**2 / blocks.horizons
     measured = (of_length, of_length) if sums is None else _block_variances(errors_m, blocks, sums, expected_m)
     freedom = 0.0 if sums is None else len(sums.trials) - 1.0
-    (of_mean, _), (of_p95, together) = (pooled_variance(one, freedom, of_length) for one in measured)
+    (of_mean, _), (of_p95, together) = (pooled_variance(variance, freedom, of_length) for variance in measured)
     of_next = 2.0 * of_p95 + spread.between**2
     factor, of_next_factor = student_factor(together), student_factor(together, NEXT_NORMAL_FACTOR)
     grown = math.exp(factor * math.sqrt(of_mean)), math.exp(factor * math.sqrt(of_p95))
@@ -332,7 +332,7 @@ def block_sums(
     trials = np.diff(first, append=len(errors))
     sums = np.add.reduceat(errors, first)
     blocks_m = np.split(errors, first[1:])
-    above = [np.array([np.count_nonzero(one > limit) for one in blocks_m]) for limit in (p50_m, p95_m)]
+    above = [np.array([np.count_nonzero(block_m > limit) for block_m in blocks_m]) for limit in (p50_m, p95_m)]
     growth = []
     for share, count in zip(SHARES.values(), above, strict=True):
         # Growth of a percentile with its share, over the range of the share's uncertainty (Woodruff 1952).

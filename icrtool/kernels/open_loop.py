@@ -92,7 +92,7 @@ def compiled_columns(track: Track) -> Columns:
     Kernels refuse a read-only column, and pandas returns read-only columns.
     """
     columns = (track.held, track.v_left, track.v_right, track.north, track.east, track.heading)
-    held, left, right, north, east, heading = (np.require(one, np.float64, ["C", "A", "W"]) for one in columns)
+    held, left, right, north, east, heading = (np.require(column, np.float64, ["C", "A", "W"]) for column in columns)
     return held, left, right, north, east, heading
 
 

@@ -217,8 +217,8 @@ def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
         return np.full(len(residuals), max(mad_std(residuals, 0.0), SMALLEST_SCALE))
     scale = np.empty(len(residuals))
     # There are few kinds, numbered from zero, so that counting is faster than sorting.
-    for one in np.flatnonzero(np.bincount(kind)):
-        mine = kind == one
+    for number in np.flatnonzero(np.bincount(kind)):
+        mine = kind == number
         scale[mine] = max(mad_std(residuals[mine], 0.0), SMALLEST_SCALE)
     return scale
 
@@ -250,10 +250,10 @@ def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None =
     if group_std is not None:
         order, first = _grouped(group)
         of_groups = [
-            normal_equations(fit.residuals[one], fit.jacobian[one], fit.weights[one])[0] * group_std
-            for one in np.split(order, first[1:])
+            normal_equations(fit.residuals[rows], fit.jacobian[rows], fit.weights[rows])[0] * group_std
+            for rows in np.split(order, first[1:])
         ]
-        expected = np.sum([one @ one.T for one in of_groups], axis=0)
+        expected = np.sum([matrix @ matrix.T for matrix in of_groups], axis=0)
     meat = _spread(fit.gradients(group), expected) + fit.prior
     inverse = np.linalg.inv(fit.information)
     sandwich = inverse @ meat @ inverse

@@ -72,7 +72,7 @@ class Track(NamedTuple):
     ) -> Self:  # fmt: skip
         """Return the track of states, every column (n,); no flags: there are none."""
         outage, jumps, slips = (
-            np.zeros(len(t), np.bool_) if one is None else one for one in (in_outage, jump, slipping)
+            np.zeros(len(t), np.bool_) if flags is None else flags for flags in (in_outage, jump, slipping)
         )
         return cls(t, held, v_left, v_right, t, north, east, t, heading, distance, outage, jumps, slips)
 
@@ -283,7 +283,7 @@ def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Rows:
     """
     ends = np.empty((len(horizons_m), len(starts)), np.int32)
     columns = (track.distance, track.place_t, horizons_m)
-    distance, place_t, horizons_m = (np.require(one, np.float64, ["C", "A", "W"]) for one in columns)
+    distance, place_t, horizons_m = (np.require(column, np.float64, ["C", "A", "W"]) for column in columns)
     gap_t, jumps = np.append(track.gap_t, np.inf), np.append(np.flatnonzero(track.jump), len(distance))
     fill_ends(distance, place_t, track.in_outage, gap_t, jumps, horizons_m, starts, ends)
     return ends.T

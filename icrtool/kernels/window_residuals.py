@@ -81,7 +81,10 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
             heading_by = np.zeros(len(turning))
         lasting = track.held[some]
         ahead = track.into * lasting
-        v_x, v_y, omega = (fixed[one] + parameters[axis == one] @ columns[axis == one] for one in (VX, VY, OMEGA))
+        v_x, v_y, omega = (
+            fixed[component] + parameters[axis == component] @ columns[axis == component]
+            for component in (VX, VY, OMEGA)
+        )
         here = slice(*np.searchsorted(row, [lo, lo + len(lasting)]))
         step, share = row[here] - lo, part[here]
         turned = lasting * omega

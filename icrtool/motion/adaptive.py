@@ -78,7 +78,7 @@ WHEELS_MODEL, TURNED_MODEL = MODELS[RECOMMENDED], MODELS[RECOMMENDED].with_gyro(
 
 SHARED_TERMS = [name for name in WHEELS_MODEL.terms if name in TURNED_MODEL.terms]
 SHARED_OF_WHEELS, SHARED_OF_TURNED = (
-    [one.terms.index(name) for name in SHARED_TERMS] for one in (WHEELS_MODEL, TURNED_MODEL)
+    [model.terms.index(name) for name in SHARED_TERMS] for model in (WHEELS_MODEL, TURNED_MODEL)
 )
 """Places of the common terms in the model without a gyro, and in the model with a gyro."""
 
@@ -324,10 +324,10 @@ class AdaptiveModel:
         x forward, y right, omega clockwise; for REP-103 (y left, counter-clockwise) negate v_y and omega.
         """
         left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
-        one = self._wheels if self._turned is None else self._turned
+        estimate = self._wheels if self._turned is None else self._turned
         gyro = np.broadcast_to(np.asarray(gyro_radps, np.float64), left.shape)
-        found = one.fitted.twist(wheel_motion(left, right, self.prior.width_m, gyro))
-        found[OMEGA] += one.constants.gyro_bias_radps
+        found = estimate.fitted.twist(wheel_motion(left, right, self.prior.width_m, gyro))
+        found[OMEGA] += estimate.constants.gyro_bias_radps
         return found[:, 0] if np.ndim(v_left) == 0 else found
 
     def _take(self, samples: Floats) -> list[Learned]:
@@ -355,9 +355,9 @@ class AdaptiveModel:
             self._next_anew_m = (1.0 + REBUILT_SHARE) * at_m
             windows = self._drive.windows(0, last, knot) or windows
         wheels: FittedModel | None = None
-        for one in (self._wheels, self._turned):
-            if one is not None:
-                solve = one.solve_anew if anew else one.solve_with
+        for estimate in (self._wheels, self._turned):
+            if estimate is not None:
+                solve = estimate.solve_anew if anew else estimate.solve_with
                 solve(windows, wheels)
-                wheels = one.fitted
+                wheels = estimate.fitted
         return True

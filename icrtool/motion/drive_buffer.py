@@ -103,7 +103,7 @@ class DriveBuffer:
         # knots come first: they count the steps that were complete before these samples
         at = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
         row = old + at
-        pose = [np.where(is_known[row], one, 0.0) for one in (*rows[POSE_ROWS[:2]][:, row], heading[at])]
+        pose = [np.where(is_known[row], column, 0.0) for column in (*rows[POSE_ROWS[:2]][:, row], heading[at])]
         steps = self._steps_before + self._steps.shape[1] + number[row]
         self._knots = np.column_stack(
             [

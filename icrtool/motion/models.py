@@ -337,7 +337,7 @@ class FittedModel:
         at = track_geometry(self.model, self.parameters, width_m)
         # complex steps (Squire and Trapp 1998)
         moved = self.parameters + TINY * 1j * np.eye(len(self.parameters))
-        columns = [np.imag(track_geometry(self.model, one, width_m)) / TINY for one in moved]
+        columns = [np.imag(track_geometry(self.model, parameters, width_m)) / TINY for parameters in moved]
         by_parameter = np.reshape(columns, (len(moved), len(at)))
         covariance: Floats = by_parameter.T @ self.covariance @ by_parameter
         return at, covariance

@@ -76,7 +76,7 @@ class LogConstants(NamedTuple):
         return self._summed(other, -1.0)
 
     def _summed(self, other: LogConstants, sign: float) -> LogConstants:
-        offset, *others = (one + sign * two for one, two in zip(self, other, strict=True))
+        offset, *others = (mine + sign * two for mine, two in zip(self, other, strict=True))
         return LogConstants(math.remainder(offset, 2.0 * math.pi), *others)
 
 
@@ -133,8 +133,8 @@ class Totals(NamedTuple):
 def totals_of(*recordings: Recording) -> Totals:
     """Return distance and time of recordings together."""
     return Totals(
-        sum(float(one.track.distance[-1]) for one in recordings),
-        sum(float(one.track.held.sum()) for one in recordings),
+        sum(float(recording.track.distance[-1]) for recording in recordings),
+        sum(float(recording.track.held.sum()) for recording in recordings),
     )
 
 
@@ -160,7 +160,7 @@ def cut_windows(
         There are fewer than `FEWEST_FIT_WINDOWS`.
     """
     track, pooled, size = recording.track, pooled or totals_of(recording), size_of(recording.width_m)
-    lengths_m = [size * one for one in WINDOWS_M] if lengths_m is None else lengths_m
+    lengths_m = [size * length_m for length_m in WINDOWS_M] if lengths_m is None else lengths_m
     every = min(max(size * EVERY_M, pooled.metres / MOST_STARTS), size * LEAST_OFTEN_M)
     windows = cut(track, lengths_m, every)
     if len(windows.begin) < FEWEST_FIT_WINDOWS:
@@ -204,9 +204,11 @@ def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:
         some = recording.wheels(slice(lo, lo + rows))
         parts.append(some.joined(np.arange(0, len(some.t), samples), into))
     t, held, left, right = (
-        np.concatenate([getattr(one, name) for one in parts]) for name in ("t", "held", "v_left", "v_right")
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "held", "v_left", "v_right")
     )
-    gyro = None if recording.track.gyro is None else np.concatenate([one.gyro for one in parts if one.gyro is not None])
+    gyro = (
+        None if recording.track.gyro is None else np.concatenate([part.gyro for part in parts if part.gyro is not None])
+    )
     return parts[0]._replace(t=t, held=held, v_left=left, v_right=right, gyro=gyro)
 
 

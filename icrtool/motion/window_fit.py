@@ -81,7 +81,7 @@ def heading_wander(turned: Floats, length_m: Floats) -> float:
     short, long = float(length_m.min()), float(length_m.max())
     if short == long:
         return 0.0
-    near, far = (mad_std(turned[length_m == one]) ** 2 for one in (short, long))
+    near, far = (mad_std(turned[length_m == length]) ** 2 for length in (short, long))
     return max(far - near, 0.0) / (long - short)
 
 
@@ -355,7 +355,7 @@ class PooledFit(FittedModel):
         """Gradient and curvature of each recording, its constants eliminated; (r, k), (r, k, k)."""
         at = self.solution
         both = [self._derivatives(self.pool.rows(i)) for i in range(len(self.pool.windows))]
-        gradients, curvatures = (np.array(one) for one in zip(*both, strict=True))
+        gradients, curvatures = (np.array(column) for column in zip(*both, strict=True))
         return gradients + at.own_pull, curvatures + at.own_prior
 
     @cached_property
@@ -422,7 +422,7 @@ def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) ->
     constants, fit = _fit_constants(windows, fitted, width_m, unknown, pool.overlap)
     std = np.sqrt(np.diag(student_covariance(fit, [pool.group])))
     without = np.full(len(CONSTANT_STD) - len(unknown), np.nan)
-    return KnownConstants(*(LogConstants(*np.append(one, without).tolist()) for one in (constants, std)))
+    return KnownConstants(*(LogConstants(*np.append(values, without).tolist()) for values in (constants, std)))
 
 
 def _fit_constants(
@@ -467,10 +467,10 @@ class Pool:
         by_window = [np.tile([*w.track.distance[[w.begin, w.end]], w.length_m], len(RESIDUAL_KINDS)) for w in windows]
         self.start_m, self.end_m, self.length_m = np.concatenate(by_window, axis=1)
         self.kind = np.concatenate([np.repeat(RESIDUAL_KINDS, len(w.begin)) for w in windows])
-        sizes = [one.shape[1] for one in by_window]
+        sizes = [window_residuals.shape[1] for window_residuals in by_window]
         self.first = np.cumsum([0, *sizes])
         self.recording = np.repeat(np.arange(len(windows)), sizes)
-        stretch_m = STRETCH_M * np.array([size_of(one) for one in widths_m])
+        stretch_m = STRETCH_M * np.array([size_of(width_m) for width_m in widths_m])
         stretch = np.column_stack([self.recording, np.floor(self.start_m / stretch_m[self.recording])])
         stretches, group = np.unique(stretch, axis=0, return_inverse=True)
         self.group = group.reshape(-1)

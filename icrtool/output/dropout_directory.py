@@ -111,7 +111,7 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
         A file cannot be written.
     """
     document = report.document
-    summary = ((one.name, *msgspec.structs.astuple(row)) for one in document.models for row in one.by_horizon)
+    summary = ((model.name, *msgspec.structs.astuple(row)) for model in document.models for row in model.by_horizon)
     (directory / "summary.csv").write_bytes(csv_bytes(("model", *SummaryRow.__struct_fields__), summary))
     histogram: list[tuple[Any, ...]] = []
     for result in report.results:
@@ -285,11 +285,13 @@ def open_baseline(path: Path) -> Baseline:
     """
     name = f"{DROPOUT_DIRECTORY}/{REPORT_FILE}"
     if not path.is_file() and (path / FLEET_FILE).is_file():
-        logs = {one.log: (Below(path, f"{one.run}/{name}"), one) for one in logs_of_fleet(path)}
-        present = {log: (report.path, one) for log, (report, one) in logs.items() if is_regular(report)}
+        logs = {log.log: (Below(path, f"{log.run}/{name}"), log) for log in logs_of_fleet(path)}
+        present = {log: (report.path, fleet_log) for log, (report, fleet_log) in logs.items() if is_regular(report)}
         reports = {log: report for log, (report, _) in present.items()}
-        kinds = {log: (one.robot, one.group) for log, (_, one) in present.items() if one.usable}
-        files = {log: known_content(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
+        kinds = {log: (fleet_log.robot, fleet_log.group) for log, (_, fleet_log) in present.items() if fleet_log.usable}
+        files = {
+            log: known_content(file.sha256 for file in fleet_log.inputs) for log, (_, fleet_log) in present.items()
+        }
         sources: tuple[Path, ...] = (path / FLEET_FILE,)
     else:
         reports, files, kinds = {}, {}, {}
@@ -299,13 +301,13 @@ def open_baseline(path: Path) -> Baseline:
             raise ConfigError(f"--baseline {path}", "no such file or directory", BASELINE_ADVICE)
         one_file = path if path.is_file() else path / REPORT_FILE
         for file in [one_file] if one_file.is_file() else sorted(path.glob(f"**/{name}")):
-            one = read_baseline(file if file == path else below(path, file))
-            if one.log in reports:
-                why = f"two reports of logs named {one.log}"
-                raise ConfigError(f"--baseline {path}", why, f"{reports[one.log]} and {file}")
-            reports[one.log], files[one.log] = file, one.sha256
-            if one.document.usable:
-                kinds[one.log] = (one.document.run.config.robot.name or "", "")
+            report = read_baseline(file if file == path else below(path, file))
+            if report.log in reports:
+                why = f"two reports of logs named {report.log}"
+                raise ConfigError(f"--baseline {path}", why, f"{reports[report.log]} and {file}")
+            reports[report.log], files[report.log] = file, report.sha256
+            if report.document.usable:
+                kinds[report.log] = (report.document.run.config.robot.name or "", "")
         sources = tuple(reports.values())
     if not reports:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", BASELINE_ADVICE)

@@ -93,7 +93,7 @@ FIGURES = {
         "report", "Two trials of {} m",
         "One of half a turn, and the straightest. The closer a coloured end is to the black one, the better its model.",
         "dropout_paths.dropout_examples",
-        lambda report: {f"{one.horizon_m:02.0f}m": () for one in report.document.examples[:1]},
+        lambda report: {f"{example.horizon_m:02.0f}m": () for example in report.document.examples[:1]},
         with_place=True, further=True,
     ),
     "worst": Entry(

@@ -82,13 +82,13 @@ def check_target(place: Place, log: Path | None = None, *, overwrite: bool = Fal
         The place has a file, a directory that is not a run, or the run of another recording; or `log` is a run.
     """
     if log is not None and is_run_directory(log):
-        path = next((one.path for one in _inputs_of(log)), "data frames")
+        path = next((file.path for file in _inputs_of(log)), "data frames")
         raise OutputError(log, "is a run, not a log", f"name its log ({path}), or: icrtool dropout-report {log}")
     check_directory(place, RUN)
     directory = path_of(place)
     if log is not None and not overwrite and RUN.is_one(directory) and not _is_made_from(directory, log):
         unknown = "data frames" if is_run_directory(directory) else "its run.json is damaged"
-        other = next((one.path for one in _inputs_of(directory)), unknown)
+        other = next((file.path for file in _inputs_of(directory)), unknown)
         advice = "name another place, or replace it with --overwrite"
         raise OutputError(directory, f"holds the run of another recording ({other})", advice)
 
@@ -104,9 +104,10 @@ def _is_made_from(directory: Path, log: Path) -> bool:
     if any(os.path.realpath(file) in sources for file in files):
         return True
     if isinstance(log, UrlPath):
-        return [one.path for one in inputs] == [str(log)]
+        return [file.path for file in inputs] == [str(log)]
     return bool(inputs) and all(
-        any(file.stat().st_size == one.bytes and file_sha256(file) == one.sha256 for file in files) for one in inputs
+        any(file.stat().st_size == stored.bytes and file_sha256(file) == stored.sha256 for file in files)
+        for stored in inputs
     )
 
 
@@ -243,14 +244,16 @@ def new_run(
         yield partial
     if note is not None and (gone := before.difference(names_in(place))):
         # The list has the name of a folder in place of the names of its files.
-        tops = [name for name in sorted(gone) if gone.isdisjoint(f"{one}/" for one in PurePosixPath(name).parents)]
+        tops = [
+            name for name in sorted(gone) if gone.isdisjoint(f"{parent}/" for parent in PurePosixPath(name).parents)
+        ]
         note(f"{path_of(directory)}: replaced: removed {listed(tops, 5)}")
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:
     """Return the path of the log whose run a new run replaces; None without a run, or for a log of equal content."""
     before, now = _inputs_of(directory), run.document.inputs
-    same = [one.identity for one in before] == [one.identity for one in now]
+    same = [file.identity for file in before] == [file.identity for file in now]
     return str(before[0].path) if before and not same else None
 
 
@@ -378,7 +381,7 @@ def log_of(run: Run) -> Path:
         raise RunError(run.directory or run.name, why, "put it back, or name it")
     folder = files[0].parent
     series = [numbered_file(file) for file in files]
-    if len(files) > 1 and len({one.series for one in series if one is not None}) == 1 and None not in series:
+    if len(files) > 1 and len({split.series for split in series if split is not None}) == 1 and None not in series:
         same_suffix = {file for file in folder.iterdir() if file.suffix == files[0].suffix}
         if files[0].suffix == ".bag" or (same_suffix != set(files) and not (folder / "metadata.yaml").is_file()):
             return split_path(files)

@@ -151,7 +151,7 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
         "about": result.study.about,
         "paper_figures": result.study.figures,
         "settings": result.request.settings(),
-        "findings": [one._asdict() for one in result.findings],
+        "findings": [number._asdict() for number in result.findings],
         "levels": result.records(),
     }
     with atomic_directory(directory, STUDY) as partial:

@@ -266,8 +266,8 @@ def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
     titled = section.title if verbose else ""
     yield from printed_parts(
         (
-            one._replace(caption="") if isinstance(one, Table) and titled and one.caption == titled else one
-            for one in section.blocks
+            part._replace(caption="") if isinstance(part, Table) and titled and part.caption == titled else part
+            for part in section.blocks
         ),
         verbose=verbose,
     )
@@ -281,10 +281,10 @@ def _labelled(block: Facts | Checks, verbose: bool) -> Iterator[tuple[str, str, 
             of_all = f"{'' if number else block.label:{LABEL + 2}}{name:{widest}}  "
             yield of_all if block.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
         return
-    for number, one in enumerate(one for one in block.rows if verbose or one.grade != "fact"):
-        first = f"{'' if number else 'checks':{LABEL + 2}}{GRADE_MARKS[one.grade]:4}{one.what:{LABEL + 3}}"
-        yield first, one.text, 1 if one.grade == "good" else BRIEF_LINES
-        yield from ((" " * len(first), more, BRIEF_LINES) for more in (one.more if verbose else ()))
+    for number, row in enumerate(row for row in block.rows if verbose or row.grade != "fact"):
+        first = f"{'' if number else 'checks':{LABEL + 2}}{GRADE_MARKS[row.grade]:4}{row.what:{LABEL + 3}}"
+        yield first, row.text, 1 if row.grade == "good" else BRIEF_LINES
+        yield from ((" " * len(first), more, BRIEF_LINES) for more in (row.more if verbose else ()))
 
 
 def _sentence(first: str, text: str, most: int, look: Look = "as is", *, verbose: bool) -> Printed:
@@ -318,7 +318,10 @@ def fitted_to(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
     ):
         out = columns_kept.pop(len(columns_kept) // 2)
         left_out.append(head[0][out] if head else f"column {out + 1}")
-    rows = [[shortened(row[one], widths[one]) if one in texts else row[one] for one in columns_kept] for row in rows]
+    rows = [
+        [shortened(row[column], widths[column]) if column in texts else row[column] for column in columns_kept]
+        for row in rows
+    ]
     align = "".join(sides[column] for column in columns_kept)
     return table._replace(align=align, rows=rows[len(head) :], head=rows[0] if head else ()), left_out
 
@@ -357,16 +360,16 @@ def _markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
         if isinstance(block, Title):
             yield from ("", f"## {_escaped_markdown(block.text)}", "", _escaped_markdown(block.facts), "")
             continue
-        for one in printed_parts([block], verbose=True):
-            if isinstance(one, Table):
-                rows = [[_escaped_markdown(cell.strip()) for cell in row] for row in one.lines()]
-                rule = ["---" if side == "l" else "---:" for side in one.sides()]
-                head = map(_escaped_markdown, one.head)
+        for part in printed_parts([block], verbose=True):
+            if isinstance(part, Table):
+                rows = [[_escaped_markdown(cell.strip()) for cell in row] for row in part.lines()]
+                rule = ["---" if side == "l" else "---:" for side in part.sides()]
+                head = map(_escaped_markdown, part.head)
                 table = ["", *(f"| {' | '.join(row)} |" for row in (head, rule, *rows)), ""]
-                yield from table if one.head else (f"- {' '.join(filter(None, row))}" for row in rows)
-            elif isinstance(one, Line) and one.look == "title":
-                yield from ("", f"### {_escaped_markdown(one.text)}", "")
-            elif text := one.text if isinstance(one, Line) else one:
+                yield from table if part.head else (f"- {' '.join(filter(None, row))}" for row in rows)
+            elif isinstance(part, Line) and part.look == "title":
+                yield from ("", f"### {_escaped_markdown(part.text)}", "")
+            elif text := part.text if isinstance(part, Line) else part:
                 yield f"- {_escaped_markdown(text)}"
 
 

@@ -70,11 +70,11 @@ def topics_text(topics: str) -> str:
 
 def jump_lines(jumps: Sequence[ReferenceJumpDocument]) -> list[str]:
     """Return a line for each jump of the reference: time, size, reason, and effect on trials."""
-    listed = sorted(jumps, key=lambda one: (one.undecided, -one.size_m))[:MOST_LINES]
+    listed = sorted(jumps, key=lambda jump: (jump.undecided, -jump.size_m))[:MOST_LINES]
     lines = [
-        f"reference jump from {one.begin_s:.1f} to {one.end_s:.1f} s: {_jump_size(one)}: {one.why}; "
-        f"{'trials cross it' if one.undecided else 'no trial crosses it'}"
-        for one in sorted(listed, key=lambda one: one.begin_ns)
+        f"reference jump from {jump.begin_s:.1f} to {jump.end_s:.1f} s: {_jump_size(jump)}: {jump.why}; "
+        f"{'trials cross it' if jump.undecided else 'no trial crosses it'}"
+        for jump in sorted(listed, key=lambda jump: jump.begin_ns)
     ]
     return [*lines, f"and {len(jumps) - len(lines):,} more in run.json"] if len(jumps) > len(lines) else lines
 
@@ -86,11 +86,11 @@ def _jump_size(jump: ReferenceJumpDocument) -> str:
 
 def jump_count(jumps: Sequence[ReferenceJumpDocument]) -> str:
     """Return the number of jumps as ``2 jumps of the reference, up to 3.1 m``; empty without jumps."""
-    decided = [one for one in jumps if not one.undecided]
+    decided = [jump for jump in jumps if not jump.undecided]
     undecided = f"{counted(len(jumps) - len(decided), 'step')} of undecided cause" if len(jumps) > len(decided) else ""
     if not decided:
         return undecided
-    largest = max(decided, key=lambda one: (one.kind == "position", one.size_m, abs(one.turn_deg)))
+    largest = max(decided, key=lambda jump: (jump.kind == "position", jump.size_m, abs(jump.turn_deg)))
     text = f"{counted(len(decided), 'jump')} of the reference, up to {_jump_size(largest)}"
     return f"{text}; {undecided}" if undecided else text
 

@@ -420,5 +420,7 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
         plan = replace(plan, changes=tuple(change for change in changes if change[0] < plan.duration_s))
         request = replace(request, plan=plan)
     settings = list(study.vary(request))
-    measured = run_scenarios([one.scenario for one in settings], request.runs, request.seed, study.measures, progress)
+    measured = run_scenarios(
+        [setting.scenario for setting in settings], request.runs, request.seed, study.measures, progress
+    )
     return StudyResult(request, study, tuple(map(Level, settings, measured)))

@@ -154,7 +154,7 @@ HOW: dict[How, Callable[[Sequence[Floats]], tuple[float, ...]]] = {
     "mean": lambda levels: (statistics(np.concatenate(levels))["mean"],),
     "percent": lambda levels: (100 * float(np.concatenate(levels).mean()),),
     "percent found": lambda levels: (100 * float(np.isfinite(np.concatenate(levels)).mean()),),
-    "range of means": lambda levels: (float(np.ptp([one.mean() for one in levels])),),
+    "range of means": lambda levels: (float(np.ptp([column.mean() for column in levels])),),
     "extreme medians": lambda levels: (float(min(map(np.median, levels))), float(max(map(np.median, levels)))),
     "first": lambda levels: _percentiles(levels[0]),
 }
@@ -273,7 +273,7 @@ class StudyResult:
             name: [level.names[name] for level in levels for _ in range(runs)] for name in levels[0].names
         }
         columns["run"] = np.tile(np.arange(runs), len(levels))
-        return columns | {name: np.concatenate([one.found[name] for one in levels]) for name in levels[0].numbers()}
+        return columns | {name: np.concatenate([level.found[name] for level in levels]) for name in levels[0].numbers()}
 
     @property
     def findings(self) -> list[StudyNumber]:
@@ -288,7 +288,7 @@ class StudyResult:
 
     def records(self) -> list[dict[str, Any]]:
         """Return the content of study.json for the levels."""
-        return [{**one.names, **self.study.summary(one.found), "metrics": one.metrics()} for one in self.levels]
+        return [{**level.names, **self.study.summary(level.found), "metrics": level.metrics()} for level in self.levels]
 
 
 def reported_numbers(numbers: Sequence[Number], levels: Sequence[Level]) -> list[StudyNumber]:

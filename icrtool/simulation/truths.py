@@ -91,7 +91,7 @@ class FrictionTruth(Truth):
 
     def poses(self, times: Floats) -> Floats:
         """Return the pose (m, 3) at times (m,) [s], linear between the rows."""
-        return np.column_stack([np.interp(times, self.t_s, one) for one in self.pose.T])
+        return np.column_stack([np.interp(times, self.t_s, column) for column in self.pose.T])
 
     def turn_rates(self, times: Floats) -> Floats:
         """Return the turn rate (m,) [rad/s], clockwise positive, at times (m,) [s]."""

@@ -31,7 +31,7 @@ def suite_of(name: str, outcome: Outcome) -> Suite:
     if isinstance(outcome, IcrToolError):
         return Suite(name, error=str(outcome))
     log = outcome.run_document.log
-    return Suite(run_title(outcome.run_document), [fleet_verdict(one, log) for one in outcome.document.gates])
+    return Suite(run_title(outcome.run_document), [fleet_verdict(verdict, log) for verdict in outcome.document.gates])
 
 
 def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-report") -> None:
@@ -48,8 +48,8 @@ def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-rep
         The file cannot be written.
     """
     root = ET.Element("testsuites", name=f"icrtool {command}")
-    for one in suites:
-        root.append(_suite(one, command))
+    for suite in suites:
+        root.append(_suite(suite, command))
     for total in ("tests", "failures", "errors", "skipped"):
         root.set(total, str(sum(int(suite.get(total, "0")) for suite in root)))
     ET.indent(root)
@@ -73,16 +73,16 @@ def _summary_blocks(report: DropoutReport) -> list[Block]:
     from icrtool.output.tables.dropout import dropout_blocks
 
     *blocks, _ = dropout_blocks(report)
-    title = next(one for one in blocks if isinstance(one, Title))
+    title = next(block for block in blocks if isinstance(block, Title))
     verdicts = suite_of("", report).verdicts
-    return [title, limit_section(verdicts), *(one for one in blocks if one is not title)]
+    return [title, limit_section(verdicts), *(block for block in blocks if block is not title)]
 
 
 def limit_section(verdicts: Sequence[FleetVerdict]) -> Section:
     """Return the verdicts under their common result, limits that are not met first; empty without any."""
-    missed = sum(not one.passed for one in verdicts)
+    missed = sum(not verdict.passed for verdict in verdicts)
     title = f"Acceptance limits not met: {missed}" if missed else "All acceptance limits are met"
-    return Section(title, [Items([one.line for one in sorted(verdicts, key=lambda one: one.passed)])])
+    return Section(title, [Items([verdict.line for verdict in sorted(verdicts, key=lambda verdict: verdict.passed)])])
 
 
 def _suite(tested: Suite, command: str) -> ET.Element:

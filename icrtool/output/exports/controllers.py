@@ -111,7 +111,7 @@ def format_export(calibration: Calibration, target: ControllerTarget) -> str:
             "icrs_m": [calibration.geometry[name] for name in ICR_COLUMNS],
             "icr_std_m": [calibration.geometry_std[name] for name in ICR_COLUMNS],
             **msgspec.structs.asdict(errors),
-            "warnings": [one.sentence for one in export_notes(calibration)],
+            "warnings": [finding.sentence for finding in export_notes(calibration)],
             "twist_width_m": robot.twist_width_m or None,
         }
         return json_bytes(document).decode().rstrip("\n")
@@ -145,11 +145,11 @@ def _parameters(calibration: Calibration, errors: ControllerErrors, target: Cont
         for x, y, yaw in (errors.pose_variance, errors.twist_variance)
     )
     if target == "nav2":
-        used = ", ".join("true" if one in ODOMETRY_USED else "false" for one in range(15))
+        used = ", ".join("true" if place in ODOMETRY_USED else "false" for place in range(15))
         alphas = enumerate((*errors.turn_noise, *errors.way_noise), start=1)
         return [
             *NAV2.format(twist=twist, used=used).splitlines(),
-            *(f"    alpha{i}: {yaml_number(one)}" for i, one in alphas),
+            *(f"    alpha{i}: {yaml_number(alpha)}" for i, alpha in alphas),
         ]
     numbers, radius = calibration.controller, calibration.robot.wheel_radius_m
     lines = [f"wheel_separation: {yaml_number(calibration.width_m)}"]
@@ -181,7 +181,8 @@ def _parameters(calibration: Calibration, errors: ControllerErrors, target: Cont
 def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     """Return the comments above: where the numbers come from, and what they cannot express."""
     (right, left, x), (std_right, std_left, std_x) = (
-        [one[name] for name in ICR_COLUMNS] for one in (calibration.geometry, calibration.geometry_std)
+        [numbers_by_name[name] for name in ICR_COLUMNS]
+        for numbers_by_name in (calibration.geometry, calibration.geometry_std)
     )
     icrs = (
         f"y_icr_right {right:+z.3f} ± {std_right:.3f} m, y_icr_left {left:+z.3f} ± {std_left:.3f} m, "
@@ -199,7 +200,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
             f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
             f"{factor:.4f} times the old"
         )
-    sentences += [f"WARNING: {one_line(one.sentence)}" for one in export_notes(calibration, FIVE)]
+    sentences += [f"WARNING: {one_line(finding.sentence)}" for finding in export_notes(calibration, FIVE)]
     return [
         line for sentence in sentences for line in textwrap.wrap(f"# {sentence}", TEXT_WIDTH, subsequent_indent="# ")
     ]

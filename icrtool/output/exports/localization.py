@@ -41,7 +41,11 @@ def _header(calibration: Calibration, numbers: Localization) -> list[str]:
     row = ", ".join([*map(yaml_number, (v_x.value, v_y.value)), *[rest] * 3, yaml_number(yaw_rate.value)])
     lines = [
         *_comment(export_origin(calibration)),
-        *(line for one in export_notes(calibration, FIVE) for line in _comment(f"WARNING: {one_line(one.sentence)}")),
+        *(
+            line
+            for finding in export_notes(calibration, FIVE)
+            for line in _comment(f"WARNING: {one_line(finding.sentence)}")
+        ),
         "#",
         *_comment(
             "robot_localization takes the covariances of its inputs from their messages: it has no parameters for them."
@@ -49,8 +53,8 @@ def _header(calibration: Calibration, numbers: Localization) -> list[str]:
         *_comment("Wheel odometry (twist.covariance); diff_drive_controller has a parameter for it:"),
         f"#   twist_covariance_diagonal: [{row}]",
         *(
-            f"#   {name}: {_estimate(one, unit)}"
-            for name, one, unit in (
+            f"#   {name}: {_estimate(estimate, unit)}"
+            for name, estimate, unit in (
                 ("vx, [0]", v_x, "m²/s²"), ("vy, [7]", v_y, "m²/s²"), ("vyaw, [35]", yaw_rate, "rad²/s²"),
             )
         ),
@@ -89,16 +93,16 @@ def _filter(numbers: Localization) -> list[str]:
             "    imu0_relative: false",
         ]
     if numbers.process:
-        for name, one in numbers.process.items():
-            lines += _inner(f"{name}: {_estimate(one)}, {one.source}")
+        for name, estimate in numbers.process.items():
+            lines += _inner(f"{name}: {_estimate(estimate)}, {estimate.source}")
         lines += ["    process_noise_covariance:", *_matrix(numbers)]
     return lines
 
 
 def _matrix(numbers: Localization) -> list[str]:
     """Return the lines of a matrix of 15 rows, with the defaults where the drive shows nothing."""
-    noise = {name: one.value for name, one in numbers.process.items()}
-    diagonal = [noise.get(name, one) for name, one in zip(STATE, DEFAULT_PROCESS, strict=True)]
+    noise = {name: estimate.value for name, estimate in numbers.process.items()}
+    diagonal = [noise.get(name, default) for name, default in zip(STATE, DEFAULT_PROCESS, strict=True)]
     rows = (
         ", ".join(yaml_number(value) if column == row else "0.0" for column in range(len(STATE)))
         for row, value in enumerate(diagonal)
@@ -127,7 +131,7 @@ def _antenna(numbers: Localization) -> list[str]:
 
 
 def _left_out(numbers: Localization) -> list[str]:
-    lines = (line for one in numbers.left_out for line in _comment(f"- {one_line(one)}", 0, "  "))
+    lines = (line for reason in numbers.left_out for line in _comment(f"- {one_line(reason)}", 0, "  "))
     return ["# Left out, because the drive does not show it:", *lines] if numbers.left_out else []
 
 

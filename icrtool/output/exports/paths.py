@@ -303,7 +303,7 @@ def _event_features(run: Run, globe: Globe) -> Iterator[Feature]:
         east, north = np.array([event.pop("east_m")]), np.array([event.pop("north_m")])
         begin = utc_text(np.array([event["begin_ns"]], np.int64))
         yield from _points(
-            "event", east, north, globe, {"begin_utc": begin} | {key: [one] for key, one in event.items()}
+            "event", east, north, globe, {"begin_utc": begin} | {key: [value] for key, value in event.items()}
         )
 
 
@@ -352,20 +352,20 @@ def format_kml(run: Run) -> str:
 def _element(tag: str, *content: str | ET.Element, **attributes: str) -> ET.Element:
     """Return an element of KML that holds a text or other elements, in their order."""
     element = ET.Element(tag if tag.startswith("{") else f"{{{KML}}}{tag}", attributes)
-    for one in content:
-        if isinstance(one, str):
-            element.text = xml_text(one)
+    for part in content:
+        if isinstance(part, str):
+            element.text = xml_text(part)
         else:
-            element.append(one)
+            element.append(part)
     return element
 
 
 def _folder(name: str, features: Iterable[Feature]) -> ET.Element:
     """Return features as place marks on the ground."""
     marks = []
-    for number, one in enumerate(features, start=1):
-        title, note, style, times = _description(one["properties"], number)
-        geometry, line = one["geometry"], one["geometry"]["type"] == "LineString"
+    for number, feature in enumerate(features, start=1):
+        title, note, style, times = _description(feature["properties"], number)
+        geometry, line = feature["geometry"], feature["geometry"]["type"] == "LineString"
         places = geometry["coordinates"] if line else [geometry["coordinates"]]
         text = " ".join(f"{east:.9f},{north:.9f},0" for east, north in places)
         shape = [*([_element("tessellate", "1")] if line else []), _element("coordinates", text)]

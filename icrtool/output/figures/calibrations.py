@@ -64,10 +64,10 @@ def forecast_figure(
         answer, f"{title}: forecast from the start without GNSS, {by}", ax, margins_in=margins_in, **layout
     )
     grown, path = sheet.subplots(1, 2)[0]
-    for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
-        if one is not None:
-            grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **style.ICR | {"linestyle": "-"} | dash)
-            grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **style.FILTER | dash)
+    for drawn, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
+        if drawn is not None:
+            grown.plot(drawn.distance_m, drawn.p95_m, label=f"95 %{words}", **style.ICR | {"linestyle": "-"} | dash)
+            grown.plot(drawn.distance_m, drawn.expected_m, label=f"expected{words}", **style.FILTER | dash)
     for budget in budgets_m:
         grown.axhline(budget, label=f"budget {budget:g} m", **style.BUDGET)
     if total_m > measured_m:
@@ -88,13 +88,13 @@ def forecast_figure(
 
 def _draw_error_circles(axes: Axes, forecast: Forecast, last_m: float) -> None:
     """Draw the circle that holds 95 % of the errors at round distances up to `last_m`, and write the distances."""
-    step_m = max(float(min(round_steps(last_m / CIRCLES), key=lambda one: abs(one - last_m / CIRCLES))), 1.0)
+    step_m = max(float(min(round_steps(last_m / CIRCLES), key=lambda step: abs(step - last_m / CIRCLES))), 1.0)
     rows = np.flatnonzero(forecast.distance_m <= last_m)
     rows = rows[np.isclose(np.round(forecast.distance_m[rows] / step_m) * step_m, forecast.distance_m[rows])]
     blue = style.ICR["color"]
     at = [(float(forecast.east_m[row]), float(forecast.north_m[row])) for row in rows]
     # the largest circle lies lowest
-    for place, row in sorted(zip(at, rows, strict=True), key=lambda one: -forecast.p95_m[one[1]]):
+    for place, row in sorted(zip(at, rows, strict=True), key=lambda circle: -forecast.p95_m[circle[1]]):
         radius = float(forecast.p95_m[row])
         axes.add_patch(Circle(place, radius, facecolor=blue, alpha=0.13, linewidth=0, zorder=1.5))
         axes.add_patch(Circle(place, radius, fill=False, edgecolor=blue, linewidth=1.0, zorder=2.5))
@@ -159,9 +159,9 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | No
     place.set_ylabel("Windows below [%]")
     heading.tick_params(labelleft=False)
     turned_deg = np.degrees(residuals.turn_rad)
-    groups = [one for one in np.array_split(np.argsort(turned_deg), TURN_GROUPS) if len(one) >= LEAST_TURNS]
+    groups = [windows for windows in np.array_split(np.argsort(turned_deg), TURN_GROUPS) if len(windows) >= LEAST_TURNS]
     for residual, look in zip(turns, looks, strict=True):
-        middle = [[float(np.median(column[one])) for one in groups] for column in (turned_deg, residual)]
+        middle = [[float(np.median(column[windows])) for windows in groups] for column in (turned_deg, residual)]
         turn.plot(*middle, marker="o", markersize=3.5, **look)
     turn.axhline(0.0, **style.HALF_WIDTH)
     turn.set(xlabel="Heading change, clockwise [°]", ylabel="Median residual [°]")
@@ -204,7 +204,7 @@ def transfer(comparison: GroupComparison, *, ax: Axes | None = None) -> Figure |
     """
     errors, rows = _errors_of_groups(comparison), _differences(comparison)
     names = " · ".join(comparison.groups)
-    longest = max((len(one.words) for one in (*errors, *rows)), default=0)
+    longest = max((len(difference.words) for difference in (*errors, *rows)), default=0)
     left_in = max(LEAST_LABELS_IN, 0.3 + CHARACTER_IN * longest)
     heights = [max(len(part), 2) for part in (errors, rows)]
     panels_in = FOREST_ROW_IN * sum(heights)
@@ -230,29 +230,31 @@ def _group(name: str) -> str:
 
 def _comparison_title(comparison: GroupComparison) -> str:
     """Return the largest difference of two groups after `CHOICE_HORIZON_M`, and whether it may be chance."""
-    at = [(pair, one) for pair in comparison.pairs for one in pair.errors if one.horizon_m == CHOICE_HORIZON_M]
-    with_cost = [(pair, one.p95_m, one) for pair, one in at if one.p95_m is not None]
+    at = [(pair, error) for pair in comparison.pairs for error in pair.errors if error.horizon_m == CHOICE_HORIZON_M]
+    with_cost = [(pair, error.p95_m, error) for pair, error in at if error.p95_m is not None]
     if not with_cost:
         return f"No two groups have trials of {CHOICE_HORIZON_M:g} m to compare"
-    pair, value_m, one = max(with_cost, key=lambda each: abs(each[1]))
+    pair, value_m, error = max(with_cost, key=lambda each: abs(each[1]))
     at_m = f"at {CHOICE_HORIZON_M:g} m"
-    if one.p95_low_m is None or one.p95_high_m is None:
+    if error.p95_low_m is None or error.p95_high_m is None:
         return f"{_group(pair.second)}: {signed(value_m, 2)} m against {_group(pair.first)} {at_m}, no interval"
-    interval = f"({signed(one.p95_low_m, 2)} to {signed(one.p95_high_m, 2)})"
-    if one.p95_low_m <= 0.0 <= one.p95_high_m:
+    interval = f"({signed(error.p95_low_m, 2)} to {signed(error.p95_high_m, 2)})"
+    if error.p95_low_m <= 0.0 <= error.p95_high_m:
         return f"No difference shown {at_m}: {signed(value_m, 2)} m {interval}"
     return f"{_group(pair.second)}: {signed(value_m, 2)} m against {_group(pair.first)} {at_m} {interval}"
 
 
 def _errors_of_groups(comparison: GroupComparison) -> list[Difference]:
     """Return the errors after `CHOICE_HORIZON_M`, by group; its own calibration, which is held out, first."""
-    cells = [one for one in comparison.transfer if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None]
-    cells.sort(key=lambda one: (list(comparison.groups).index(one.tested_on), one.calibrated_on != one.tested_on))
+    cells = [cell for cell in comparison.transfer if cell.horizon_m == CHOICE_HORIZON_M and cell.p95_m is not None]
+    cells.sort(key=lambda cell: (list(comparison.groups).index(cell.tested_on), cell.calibrated_on != cell.tested_on))
     rows = []
-    for one in cells:
-        by = "own" if one.calibrated_on == one.tested_on else f"by {_group(one.calibrated_on)}'s"
+    for cell in cells:
+        by = "own" if cell.calibrated_on == cell.tested_on else f"by {_group(cell.calibrated_on)}'s"
         rows.append(
-            Difference(f"{_group(one.tested_on)}, {by} calibration", one.p95_m or 0.0, one.p95_low_m, one.p95_high_m)
+            Difference(
+                f"{_group(cell.tested_on)}, {by} calibration", cell.p95_m or 0.0, cell.p95_low_m, cell.p95_high_m
+            )
         )
     return rows
 
@@ -260,31 +262,35 @@ def _errors_of_groups(comparison: GroupComparison) -> list[Difference]:
 def _differences(comparison: GroupComparison) -> list[Difference]:
     """Return differences between groups with their own calibrations, then the costs of foreign calibrations."""
     rows: list[tuple[ErrorsAt, str]] = [
-        (one, f"{_group(pair.second)} − {_group(pair.first)}, {one.horizon_m:g} m")
-        for pair in comparison.pairs for one in pair.errors
+        (error, f"{_group(pair.second)} − {_group(pair.first)}, {error.horizon_m:g} m")
+        for pair in comparison.pairs for error in pair.errors
     ]  # fmt: skip
     rows += [
-        (one, f"{_group(one.tested_on)}, by {_group(one.calibrated_on)}'s − own, {one.horizon_m:g} m")
-        for one in comparison.costs
+        (cost, f"{_group(cost.tested_on)}, by {_group(cost.calibrated_on)}'s − own, {cost.horizon_m:g} m")
+        for cost in comparison.costs
     ]
     if len(rows) > MOST_DIFFERENCES:
-        rows = [(one, words) for one, words in rows if one.horizon_m == CHOICE_HORIZON_M]
-    return [Difference(words, one.p95_m, one.p95_low_m, one.p95_high_m) for one, words in rows if one.p95_m is not None]
+        rows = [(error, words) for error, words in rows if error.horizon_m == CHOICE_HORIZON_M]
+    return [
+        Difference(words, error.p95_m, error.p95_low_m, error.p95_high_m)
+        for error, words in rows
+        if error.p95_m is not None
+    ]
 
 
 def _draw_forest(axes: Axes, rows: Sequence[Difference], *, about_zero: bool = False) -> None:
     """Draw numbers with their intervals, a row each; `about_zero`: an interval that holds zero may be chance."""
-    for y, one in enumerate(rows):
-        if one.low_m is None or one.high_m is None:
-            axes.plot([one.value_m], [y], label="no interval: too little path", **ALONE_LOOK)
+    for y, row in enumerate(rows):
+        if row.low_m is None or row.high_m is None:
+            axes.plot([row.value_m], [y], label="no interval: too little path", **ALONE_LOOK)
             continue
-        chance = about_zero and one.low_m <= 0.0 <= one.high_m
+        chance = about_zero and row.low_m <= 0.0 <= row.high_m
         look, label = (CHANCE_LOOK, "may be chance: holds 0") if chance else (SURE_LOOK, "with 95 % interval")
-        reach = [[max(one.value_m - one.low_m, 0.0)], [max(one.high_m - one.value_m, 0.0)]]
-        axes.errorbar([one.value_m], [y], xerr=reach, label=label, **look)
+        reach = [[max(row.value_m - row.low_m, 0.0)], [max(row.high_m - row.value_m, 0.0)]]
+        axes.errorbar([row.value_m], [y], xerr=reach, label=label, **look)
     if about_zero:
         axes.axvline(0.0, **style.HALF_WIDTH)
-    axes.set_yticks(range(len(rows)), [one.words for one in rows], parse_math=False)
+    axes.set_yticks(range(len(rows)), [row.words for row in rows], parse_math=False)
     axes.set_ylim(max(len(rows), 1) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
 
@@ -359,7 +365,9 @@ def fleet_icrs(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
                 axes.errorbar(icrs, rows, xerr=stds, markersize=5.0, capsize=2.0, label=_key_of(robot), **look)
             axes.set_xlabel(f"ICR y {side} [m]")
             axes.locator_params(axis="x", nbins=4)
-        left.set_yticks(range(len(ordered)), [_dated(one.log, one.start_utc) for one in ordered], parse_math=False)
+        left.set_yticks(
+            range(len(ordered)), [_dated(point.log, point.start_utc) for point in ordered], parse_math=False
+        )
         right.tick_params(labelleft=False)
         left.set_ylim(len(ordered) - 0.4, -0.6)
     sheet.legend(ncols=4)
@@ -406,10 +414,10 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
     errors = [
         (group, log, error)
         for group, logs in fleet.errors_m.items()
-        for log, error in sorted(logs.items(), key=lambda one: -one[1])
+        for log, error in sorted(logs.items(), key=lambda named_error: -named_error[1])
     ]
-    largest = sorted(errors, key=lambda one: -one[2])[:MOST_CALENDAR_ROWS]
-    robots = [one for one in errors if one in largest]
+    largest = sorted(errors, key=lambda log_error: -log_error[2])[:MOST_CALENDAR_ROWS]
+    robots = [log_error for log_error in errors if log_error in largest]
     cut = f", the {MOST_CALENDAR_ROWS} largest" if len(errors) > MOST_CALENDAR_ROWS else ""
     median = error_text(float(np.median([error for *_, error in errors])))
     labels = [_dated(log, fleet.starts_utc.get(log, "")) for _, log, _ in robots]
@@ -422,7 +430,7 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
     axes.set_yticks(range(len(labels)), labels, parse_math=False)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     for (group, logs), look in zip(fleet.errors_m.items(), cycle(GROUP_LOOKS), strict=False):
-        rows = [row for row, one in enumerate(robots) if one[0] == group]
+        rows = [row for row, robot in enumerate(robots) if robot[0] == group]
         middle = error_text(float(np.median(list(logs.values()))))
         label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
         axes.plot([robots[row][2] for row in rows], rows, markersize=5.5, label=label, zorder=3, **look)

@@ -78,10 +78,10 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     interval on this drive, and where its error on the next drive lies. The others have bars at some distances, so that
     no two bands overlap. `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
-    models = [*_models(report), *(one for one in _pictured(report) if row_of(one.name).compared)]
+    models = [*_models(report), *(result for result in _pictured(report) if row_of(result.name).compared)]
     first, horizons_m = models[0], report.horizons_m
-    budgets_m = list(dict.fromkeys(one.budget_m for one in report.document.budgets))
-    reached = [one for one in report.document.budgets if one.model in {model.name for model in models}]
+    budgets_m = list(dict.fromkeys(reach.budget_m for reach in report.document.budgets))
+    reached = [reach for reach in report.document.budgets if reach.model in {model.name for model in models}]
     pens, rows = _pens(report), [row for row in first.document.by_horizon if row.p95_m is not None]
     ends = [rows[row] for row in ((0, -1) if len(rows) > 1 else (0,) if rows else ())]
     trials = ", ".join(f"{row.trials:,} trials of {row.horizon_m:g} m" for row in ends)
@@ -93,26 +93,28 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     )  # fmt: skip
     axes = sheet.subplots()[0, 0]
     curves: list[tuple[Floats, Floats]] = []
-    bars = [one for one in models[1:] if not row_of(one.name).compared]
-    for one in models:
+    bars = [model for model in models[1:] if not row_of(model.name).compared]
+    for model in models:
         crossings = [
-            (found.distance_m, found.budget_m) for found in reached if found.model == one.name and not found.beyond
+            (found.distance_m, found.budget_m) for found in reached if found.model == model.name and not found.beyond
         ]
         # A line begins where trials do, or where its model has used up the budget.
-        if row_of(one.name).compared:
+        if row_of(model.name).compared:
             crossings = [found for found in crossings if found[0] >= horizons_m[0]]
-        curves.append(_draw_model(axes, one, horizons_m, crossings, pens[one.name], first=one is first))
-        if one in bars:
-            shift_m = BAR_STEP * float(horizons_m[-1]) * (bars.index(one) + 1) * (-1) ** bars.index(one)
-            curves += _draw_bars(axes, one, horizons_m, shift_m, pens[one.name])
-    outages = [one for one in report.document.outages if one.kind == "real" and one.distance_m <= horizons_m[-1]]
+        curves.append(_draw_model(axes, model, horizons_m, crossings, pens[model.name], first=model is first))
+        if model in bars:
+            shift_m = BAR_STEP * float(horizons_m[-1]) * (bars.index(model) + 1) * (-1) ** bars.index(model)
+            curves += _draw_bars(axes, model, horizons_m, shift_m, pens[model.name])
+    outages = [
+        outage for outage in report.document.outages if outage.kind == "real" and outage.distance_m <= horizons_m[-1]
+    ]
     if bars:
         axes.errorbar([], [], [], label="other 95 % intervals", **BAR_LOOK | {"color": "0.35"})
     if outages:
         look = style.spot_look("black", 7.0, "X") | {"zorder": 5, "label": "real outage"}
         axes.plot(column_of(outages, "distance_m"), column_of(outages, "end_error_m"), **look)
     # The scale holds all errors from the first horizon on, over at most `MOST_DECADES`, and the band where it is near.
-    drawn = [*(one.column("p95_m") for one in models), first.column("expected_error_m")]
+    drawn = [*(model.column("p95_m") for model in models), first.column("expected_error_m")]
     errors = np.concatenate([*drawn, budgets_m, column_of(outages, "end_error_m")])
     errors = errors[np.isfinite(errors) & (errors > 0)]
     low, high = 0.01, 1.0
@@ -124,11 +126,15 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     axes.set(xlim=(0, horizons_m[-1] * 1.02), ylim=(low, high), xlabel=f"Distance without {word} [m]")
     axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
     style.logarithmic_errors(axes, "y")
-    label = f"budget {' and '.join(f'{one:g}' for one in budgets_m)} m"
+    label = f"budget {' and '.join(f'{budget_m:g}' for budget_m in budgets_m)} m"
     marked = []
     for budget in budgets_m:
         axes.axhline(budget, label=label, **style.BUDGET)
-        marked += [one for one in reached if one.budget_m == budget and not (one.beyond or row_of(one.model).compared)]
+        marked += [
+            reach
+            for reach in reached
+            if reach.budget_m == budget and not (reach.beyond or row_of(reach.model).compared)
+        ]
     _write_end(axes, report, first)
     _mark_reaches(axes, marked, pens, low, curves)
     sheet.legend(ncols=SUMMARY_KEY_COLUMNS)
@@ -137,7 +143,7 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
 
 def _summary_title(report: DropoutReport, first: ModelResult) -> str:
     """Return how far the first row stays within its budget, on this drive and on the next; else its last error."""
-    best = next((one for one in report.document.budgets if one.model == first.name), None)
+    best = next((reach for reach in report.document.budgets if reach.model == first.name), None)
     if best is not None:
         # One question, two answers: where the next drive has the same, one is enough.
         after = f"; next drive {best.next_text}" if best.next_text and best.next_text != best.short_text else ""
@@ -184,10 +190,10 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | Non
     """
     asked = [_place(report, metres) for metres in horizons_m]
     of_models = (
-        (one, [h for h in asked if len(one.histograms[h].left)]) for one in (*_models(report), *report.results)
+        (result, [h for h in asked if len(result.histograms[h].left)]) for result in (*_models(report), *report.results)
     )
     model, places = next(drawn for drawn in of_models if drawn[1])
-    budgets_m = dict.fromkeys(one.budget_m for one in report.document.budgets)
+    budgets_m = dict.fromkeys(reach.budget_m for reach in report.document.budgets)
     errors = ", ".join(error_text(model.document.by_horizon[h].p95_m).removesuffix(" m") for h in places)
     distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
     title = f"95 % of the trials end within {errors} m after {distances} m"
@@ -196,7 +202,9 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | Non
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=margins_in, hspace=0.38)
     panels = sheet.subplots(len(places), 1, sharex=True)[:, 0]
     p95 = model.column("p95_m")[places]
-    end = LEAST_HISTOGRAM_IN_P95 * max([np.nanmax(p95), *(one for one in budgets_m if one < 2 * np.nanmax(p95))])
+    end = LEAST_HISTOGRAM_IN_P95 * max(
+        [np.nanmax(p95), *(budget_m for budget_m in budgets_m if budget_m < 2 * np.nanmax(p95))]
+    )
     for axes, h in zip(panels, places, strict=True):
         heading = f"after {report.horizons_m[h]:g} m, {model.document.by_horizon[h].trials:,} trials"
         _draw_bins(axes, model, h, _pens(report)[model.name]["color"], end, heading)
@@ -238,20 +246,22 @@ def dropout_histogram(report: DropoutReport, horizon_m: float, *, ax: Axes | Non
 
 def _pictured(report: DropoutReport) -> list[ModelResult]:
     """Return the rows that pictures show, in order."""
-    by_name = {one.name: one for one in report.results}
+    by_name = {result.name: result for result in report.results}
     return [by_name[name] for name, row in rows_of(by_name).items() if row.pictured] or list(report.results[:1])
 
 
 def _models(report: DropoutReport) -> list[ModelResult]:
     """Return the rows that pictures of distance show, the best row first, without the rows for comparison."""
-    shown_names = shown_rows([one.name for one in report.results])
-    pictured = [one for one in _pictured(report) if one.name in shown_names and not row_of(one.name).compared]
+    shown_names = shown_rows([result.name for result in report.results])
+    pictured = [
+        result for result in _pictured(report) if result.name in shown_names and not row_of(result.name).compared
+    ]
     best = report.document.best.model if report.document.best is not None else ""
-    return sorted(pictured, key=lambda one: one.name != best) or list(report.results[:1])
+    return sorted(pictured, key=lambda result: result.name != best) or list(report.results[:1])
 
 
 def _pens(report: DropoutReport) -> dict[str, style.Look]:
-    return style.row_pens(one.name for one in report.results)
+    return style.row_pens(result.name for result in report.results)
 
 
 def _place(report: DropoutReport, horizon_m: float) -> int:
@@ -305,15 +315,15 @@ def _mark_reaches(
 ) -> None:  # fmt: skip
     """Mark where models reach a budget, and write the distance where it covers no line."""
     lines = list(curves)
-    for one in reached:
-        pen = pens[one.model]
-        axes.plot([one.distance_m] * 2, [lowest_m, one.budget_m], color=pen["color"], linewidth=0.7, zorder=1.5)
-        axes.plot([one.distance_m], [one.budget_m], zorder=5, **style.spot_look("white", color=pen["color"]))
-        lines.append((np.full(2, one.distance_m), np.array([lowest_m, one.budget_m])))
-        lines.append((np.array(axes.get_xlim()), np.full(2, one.budget_m)))
+    for reach in reached:
+        pen = pens[reach.model]
+        axes.plot([reach.distance_m] * 2, [lowest_m, reach.budget_m], color=pen["color"], linewidth=0.7, zorder=1.5)
+        axes.plot([reach.distance_m], [reach.budget_m], zorder=5, **style.spot_look("white", color=pen["color"]))
+        lines.append((np.full(2, reach.distance_m), np.array([lowest_m, reach.budget_m])))
+        lines.append((np.array(axes.get_xlim()), np.full(2, reach.budget_m)))
     labels = [
-        Label(f"{one.distance_m:.1f} m", one.distance_m, one.budget_m, pens[one.model]["color"])
-        for one in sorted(reached, key=lambda one: one.distance_m)
+        Label(f"{reach.distance_m:.1f} m", reach.distance_m, reach.budget_m, pens[reach.model]["color"])
+        for reach in sorted(reached, key=lambda reach: reach.distance_m)
     ]
     write_labels(axes, labels, lines, crossing=True, size_pt=9.0, fontweight="bold")
 

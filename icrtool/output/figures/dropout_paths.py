@@ -77,8 +77,8 @@ def dropout_examples(report: DropoutReport, *, ax: Axes | None = None) -> Figure
         The report holds none; `icrtool.dropout_report` makes one that does.
     """
     examples = _needed(report, report.examples, "example trials")
-    trials = [one.document for one in examples]
-    errors = " and ".join(error_text(one.errors_m[one.model]) for one in trials)
+    trials = [example.document for example in examples]
+    errors = " and ".join(error_text(trial.errors_m[trial.model]) for trial in trials)
     what = "about half a turn (left), as straight as the drive has it (right)"
     title = f"Typical trials of {trials[0].horizon_m:g} m end {errors} off"
     subtitle = f"{run_title(report.run_document)}: {what}"
@@ -122,7 +122,7 @@ def dropout_worst(report: DropoutReport, *, ax: Axes | None = None) -> Figure | 
     for axes in panels:
         axes.spines[["top", "right"]].set_visible(True)
         axes.spines[:].set_color(FRAME_COLOR)
-    _draw_overview(panels[0], [one.document for one in worst], report.reference_north_m, report.reference_east_m)
+    _draw_overview(panels[0], [trial.document for trial in worst], report.reference_north_m, report.reference_east_m)
     for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
         _draw_drive(axes, report, drive, ticks=0)
         _draw_scale(axes)
@@ -186,12 +186,12 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     parts = []
     for kind in OUTAGES:
         # Number and largest end error of each kind.
-        if ours := [one.document for one in outages if one.document.kind == kind]:
-            worst = max(one.end_error_m or 0.0 for one in ours)
-            lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
+        if ours := [outage.document for outage in outages if outage.document.kind == kind]:
+            worst = max(outage.end_error_m or 0.0 for outage in ours)
+            lengths = sorted({round(outage.end_s - outage.begin_s, 1) for outage in ours})
             span = " to ".join(duration_text(length) for length in dict.fromkeys((lengths[0], lengths[-1])))
             parts.append(f"{len(ours)} {kind} of {span}, up to {error_text(worst)}")
-    largest = max(one.document.end_error_m or 0.0 for one in outages)
+    largest = max(outage.document.end_error_m or 0.0 for outage in outages)
     title = f"Without {fix_word(report.run_document)} the robot ends up to {error_text(largest)} off"
     part = "" if whole else "; a part of the path"
     subtitle = f"{run_title(report.run_document)}: {'; '.join(parts)}{part}"
@@ -199,19 +199,21 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     axes = sheet.subplots()[0, 0]
     cell = look_down(axes, norths, easts, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
-    for one in outages:
-        kind = one.document.kind
-        draw_path(axes, one.north_m, one.east_m, cell, OUTAGES[kind], zorder=3, label=f"{kind} outage")
+    for outage in outages:
+        kind = outage.document.kind
+        draw_path(axes, outage.north_m, outage.east_m, cell, OUTAGES[kind], zorder=3, label=f"{kind} outage")
     for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
-        ends = [(one.east_m[row], one.north_m[row]) for one in outages]
+        ends = [(outage.east_m[row], outage.north_m[row]) for outage in outages]
         axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **style.spot_look(fill))
     # Number and end error near the end of each outage where there is space; the tables hold all of them.
     labels = [
-        Label(f"{number}: {error_text(one.document.end_error_m)}", float(one.east_m[-1]), float(one.north_m[-1]))
-        for number, one in enumerate(outages, start=1)
+        Label(
+            f"{number}: {error_text(outage.document.end_error_m)}", float(outage.east_m[-1]), float(outage.north_m[-1])
+        )
+        for number, outage in enumerate(outages, start=1)
     ]
-    lines = [(one.east_m, one.north_m) for one in outages]
-    begins = [(float(one.east_m[0]), float(one.north_m[0])) for one in outages]
+    lines = [(outage.east_m, outage.north_m) for outage in outages]
+    begins = [(float(outage.east_m[0]), float(outage.north_m[0])) for outage in outages]
     lines.append((report.reference_east_m, report.reference_north_m))
     write_labels(axes, labels, lines, crossing=True, marks=begins)
     name_directions(axes, report.run_document)
@@ -229,7 +231,7 @@ MOST_VIEW = 0.7
 def _view_of_outages(report: DropoutReport, outages: Sequence[Outage]) -> tuple[Floats, Floats, bool]:
     """Return north and east (n,) [m] of what the view of outages holds, and whether that is the whole path."""
     paths = report.reference_north_m, report.reference_east_m
-    lost = [np.concatenate([getattr(one, name) for one in outages]) for name in ("north_m", "east_m")]
+    lost = [np.concatenate([getattr(outage, name) for outage in outages]) for name in ("north_m", "east_m")]
     span_m = max(float(np.ptp(path)) for path in paths)
     sizes_m = [max(1.6 * float(np.ptp(column)), LEAST_VIEW * span_m) for column in lost]
     if max(sizes_m) > MOST_VIEW * span_m:
@@ -302,7 +304,7 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
     drawn = drawn[np.argsort(error_m[drawn], kind="stable")]
     place = np.column_stack([east[rows], north[rows]])
     end = min(most, MOST_OF_P95 * p95) or 1.0
-    step = float(min(round_steps(end / ERROR_STEPS), key=lambda one: abs(one - end / ERROR_STEPS)))
+    step = float(min(round_steps(end / ERROR_STEPS), key=lambda step: abs(step - end / ERROR_STEPS)))
     steps = step * np.arange(np.ceil(end / step) + 1)
     shades = ListedColormap(colormaps[ERROR_MAP](np.linspace(LIGHTEST, 1.0, len(steps) - 1)))
     lines = LineCollection(
@@ -357,11 +359,11 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, ticks: i
         look = style.spot_look(pen["color"], 4.5, "D", pen["color"])
         axes.plot(east[-1:], north[-1:], zorder=5, label="where each ends", **look)
     end_s = trial.t_s + trial.horizon_m / max(trial.speed_mean_mps, SLOWEST_SHOWN_MPS)
-    for one in report.outages:
-        span = one.document
+    for outage in report.outages:
+        span = outage.document
         if span.kind == "real" and trial.t_s <= span.end_s and span.begin_s <= end_s:
-            axes.plot(one.east_m - trial.east_m, one.north_m - trial.north_m, label="real outage", **LOST_LOOK)
-    jumps = [one for one in report.run_document.reference_jumps if trial.t_s <= one.end_s and one.begin_s <= end_s]
+            axes.plot(outage.east_m - trial.east_m, outage.north_m - trial.north_m, label="real outage", **LOST_LOOK)
+    jumps = [jump for jump in report.run_document.reference_jumps if trial.t_s <= jump.end_s and jump.begin_s <= end_s]
     if jumps:
-        place = [[one.east_m - trial.east_m for one in jumps], [one.north_m - trial.north_m for one in jumps]]
+        place = [[jump.east_m - trial.east_m for jump in jumps], [jump.north_m - trial.north_m for jump in jumps]]
         axes.plot(*place, label="step of the reference", **JUMP_LOOK)

@@ -71,7 +71,9 @@ def icr_estimates(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     is a new figure.
     """
     finals, stds = run.document.icr.final, run.document.icr.final_std
-    ends = ", ".join(f"{ICR_WORDS[one]} {signed(at)} m" for one in ICR_COLUMNS if (at := finals[one]) is not None)
+    ends = ", ".join(
+        f"{ICR_WORDS[column]} {signed(at)} m" for column in ICR_COLUMNS if (at := finals[column]) is not None
+    )
     unknown = ", ".join(ICR_WORDS[column] for column in ICR_COLUMNS if finals[column] is None)
     title = f"The ICRs end at {ends}{f'; not shown: {unknown}' if unknown else ''}"
     spans = [(0.0, float(run.table.t_s[-1]))]

@@ -69,11 +69,13 @@ def write_labels(
     step = PATH_STEP_PT * point_px
     drawn = [axes.transData.transform(np.column_stack([x, y])) for x, y in paths]
     crossed = np.concatenate([np.empty((0, 2)), *(_along(path, step) for path in drawn)])
-    spots = axes.transData.transform(np.array([*((one.x, one.y) for one in labels), *marks], np.float64).reshape(-1, 2))
+    spots = axes.transData.transform(
+        np.array([*((label.x, label.y) for label in labels), *marks], np.float64).reshape(-1, 2)
+    )
     half, written = MARK_PT * point_px, []
     occupied = np.concatenate([spots - half, spots + half], axis=1)
-    for one, spot in zip(labels, spots, strict=False):
-        width, height = (size_pt / SIZE_PT * point_px * part for part in (CHARACTER_PT * len(one.text), LINE_PT))
+    for label, spot in zip(labels, spots, strict=False):
+        width, height = (size_pt / SIZE_PT * point_px * part for part in (CHARACTER_PT * len(label.text), LINE_PT))
         second, free = None, None
         for dx, dy in (offset for offset in OFFSETS_PT if math.hypot(*offset) <= farthest_pt):
             x, y = spot + point_px * np.array([dx, dy]) - (width if dx <= 0 else 0.0, height / 2)
@@ -89,12 +91,12 @@ def write_labels(
         if free is None:
             continue
         dx, dy, box = free
-        written.append(one)
+        written.append(label)
         occupied = np.concatenate([occupied, box[None]])
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(dx, dy) > LINE_FROM_PT else None
         near: style.Look = {"ha": "left" if dx > 0 else "right", "va": "center", "fontsize": size_pt, "zorder": 6}
-        near["color"] = one.color
-        style.write_near(axes, one.text, (one.x, one.y), (dx, dy), **near | {"arrowprops": line} | look)
+        near["color"] = label.color
+        style.write_near(axes, label.text, (label.x, label.y), (dx, dy), **near | {"arrowprops": line} | look)
     return written
 
 
@@ -106,7 +108,10 @@ def _along(path: Floats, step: float) -> Floats:
         return kept
     lengths = np.hypot(*np.diff(kept, axis=0).T)
     count = np.minimum(np.ceil(lengths / step), MOST_BETWEEN).astype(np.int64)
-    begins, share = np.repeat(np.arange(len(count)), count), np.concatenate([np.arange(one) / one for one in count])
+    begins, share = (
+        np.repeat(np.arange(len(count)), count),
+        np.concatenate([np.arange(parts) / parts for parts in count]),
+    )
     between = kept[begins] + share[:, None] * (kept[begins + 1] - kept[begins])
     return np.concatenate([between, kept[-1:]])
 

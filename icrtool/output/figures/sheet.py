@@ -158,7 +158,7 @@ class Sheet:
 
         Black becomes the colour of the axes' names, white their background, and a grey lies between both.
         """
-        fore, back = (np.array(to_rgb(one)) for one in (ax.xaxis.label.get_color(), _background(ax)))
+        fore, back = (np.array(to_rgb(color)) for color in (ax.xaxis.label.get_color(), _background(ax)))
         if not (back.mean() < MID_GREY < fore.mean()):
             return
 
@@ -181,7 +181,7 @@ class Sheet:
                 of_line = ("color", "markerfacecolor", "markeredgecolor")
                 names = of_line if isinstance(artist, Line2D) else ("facecolor", "edgecolor")
                 properties = {name: getattr(artist, f"get_{name}")() for name in names}
-                artist.set(**{name: fitted(one) for name, one in properties.items() if len(to_rgba_array(one))})
+                artist.set(**{name: fitted(color) for name, color in properties.items() if len(to_rgba_array(color))})
             for text in panel.texts:
                 # light words have the caller's colour already
                 if text not in self.of_caller and np.mean(to_rgb(text.get_color())) < MID_GREY:

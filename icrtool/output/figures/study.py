@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 def study_title(result: StudyResult) -> str:
     """Return the answer of a study with its number, by series."""
     study = result.study
-    answer = ", ".join(f"{finding_text(one)} ({one.what})" for one in result.answer)
+    answer = ", ".join(f"{finding_text(number)} ({number.what})" for number in result.answer)
     value = study.answer.values_among(result.levels)[0]
     return study.title.format(answer=answer, value=value)
 
@@ -114,7 +114,13 @@ def over(
     values = [level.setting.value for level in levels]
     for place, (column, look) in enumerate(columns.items()):
         numbers = [level.metrics()[column] for level in levels]
-        _points(axes, values, [(one["p5"], one["p50"], one["p95"]) for one in numbers], look, 0.15 * (place - 1))
+        _points(
+            axes,
+            values,
+            [(statistics["p5"], statistics["p50"], statistics["p95"]) for statistics in numbers],
+            look,
+            0.15 * (place - 1),
+        )
     axes.set_xlabel(_varied(result))
     if "x" in log:
         axes.set_xscale("log")
@@ -171,7 +177,7 @@ def along(axes: Axes, t: Floats, values: Floats, look: style.Look) -> None:
 def estimates(axes: Axes, _result: StudyResult, levels: Sequence[Level], value: str = "", name: str = "trace") -> None:
     """Draw the ICR estimates of one level along time, and the truth."""
     value = value or str(shown_path([level.setting.value for level in levels])[0])
-    level = next(one for one in levels if one.setting.value == value)
+    level = next(level for level in levels if level.setting.value == value)
     traces, plan = level.found[name], level.setting.scenario.plan
     t = traces[0, :, 0]
     truth = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)])
@@ -248,7 +254,7 @@ def coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the share of the time in which the truth is within 2 sigma, by state."""
     for place, (level, look) in enumerate(zip(levels, STUDY_LOOKS, strict=False)):
         held = consistency_of(level.found)["coverage_pct"]
-        _points(axes, STUDY_STATES, [(one, one, one) for one in held], look, 0.15 * (place - 1))
+        _points(axes, STUDY_STATES, [(share, share, share) for share in held], look, 0.15 * (place - 1))
     axes.axhline(95.4, color="black", **TRUTH)
 
 

@@ -201,7 +201,7 @@ def check_directory(directory: Place, kind: Kind) -> None:
         if aside and not os.path.lexists(place):
             max(aside, key=lambda path: path.stat().st_mtime_ns).rename(place)
         names = names_in(place)
-        if file := next((one for one in (place, *place.parents) if one.exists() and not one.is_dir()), None):
+        if file := next((path for path in (place, *place.parents) if path.exists() and not path.is_dir()), None):
             why = "a file is there" if file == place else f"{file} is a file"
             advice = f"name another place for the {kind.name}"
         elif not kind.is_one(place):
@@ -212,7 +212,9 @@ def check_directory(directory: Place, kind: Kind) -> None:
             advice = "move it elsewhere first, or name another place"
         else:
             folders = [place, *(place / name for name in names_in(place) if name.endswith("/"))]
-            if kept := next((one for one in folders if one.is_dir() and not os.access(one, os.W_OK | os.X_OK)), None):
+            if kept := next(
+                (folder for folder in folders if folder.is_dir() and not os.access(folder, os.W_OK | os.X_OK)), None
+            ):
                 # A write-protected directory could be renamed but not removed, and would stay under a hidden name.
                 why = "is write-protected, and so cannot be replaced"
                 advice = f"make {kept.relative_to(place.parent)}/ writable, or name another place"
@@ -345,11 +347,11 @@ def put_in_place(partial: Path, place: Path) -> None:
     sync(place.parent)
 
 
-def _exchange(one: Path, other: Path) -> bool:
+def _exchange(first: Path, other: Path) -> bool:
     """Give two directories each other's names in one step, and return whether that was possible here."""
     if sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "renameat2"):
         return False
-    names = AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other)
+    names = AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(other)
     return not ctypes.CDLL(None).renameat2(*names, RENAME_EXCHANGE)
 
 

@@ -329,9 +329,9 @@ def logs_of_fleet(directory: Path) -> list[FleetLog]:
         The folder does not hold the result of a batch.
     """
     try:
-        usable = [one for one in read_fleet(directory).logs if one.status != "failed"]
-        for one in usable:
-            Below(directory, one.run).check_links()
+        usable = [log for log in read_fleet(directory).logs if log.status != "failed"]
+        for log in usable:
+            Below(directory, log.run).check_links()
     except (OSError, ValueError, RecursionError) as err:
         raise RunError(directory, f"its {FLEET_FILE} cannot be read ({err})", "name the folder of a batch") from err
     return usable

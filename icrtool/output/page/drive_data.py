@@ -90,26 +90,26 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "half_width_m": half,
         "icr_scale_m": scale_of(shown),
         **_models_data(run, report, rows, joined, origin),
-        "events": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in run.document.events],
-        "outages": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
+        "events": [{"begin_s": event.begin_s, "end_s": event.end_s} for event in run.document.events],
+        "outages": [{"begin_s": outage.begin_s, "end_s": outage.end_s} for outage in report.outages],
         "changes_s": list(run.changes_s),
         "errors": errors_data(report),
-        "budgets_m": sorted({one.budget_m for one in report.budgets}),
+        "budgets_m": sorted({reach.budget_m for reach in report.budgets}),
     }
 
 
 def errors_data(report: DropoutDocument) -> dict[str, object]:
     """Return the errors over distance by model, and the errors of the reference alone."""
     models = in_row_order(report.models)
-    rows = rows_of(one.name for one in models)
+    rows = rows_of(model.name for model in models)
     shown_names = shown_rows(list(rows))
     reference = report.reference_error
     return {
         "horizons_m": [row.horizon_m for row in models[0].by_horizon] if models else [],
         "models": [
-            {"name": one.name, "label": one.name, "shown": one.name in shown_names, **row_look(rows[one.name])}
-            | {key: [getattr(row, column) for row in one.by_horizon] for key, column in ERROR_KEYS.items()}
-            for one in models
+            {"name": model.name, "label": model.name, "shown": model.name in shown_names, **row_look(rows[model.name])}
+            | {key: [getattr(row, column) for row in model.by_horizon] for key, column in ERROR_KEYS.items()}
+            for model in models
         ],
         "reference": {"p95": [row.p95_m for row in reference], "expected": [row.expected_m for row in reference]},
         "banded": report.best.model if report.best is not None else next(iter(shown_names), ""),
@@ -146,7 +146,7 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
     icrs: dict[str, IcrColumn] = {"y_right": "y_icr_right_m", "y_left": "y_icr_left_m", "x": "x_icr_m"}
     values = {name: getattr(table, column)[steps] for name, column in icrs.items()}
     speeds = {"v_left": table.v_left_mps, "v_right": table.v_right_mps}
-    rows = extremes(*(one[steps] for one in speeds.values()), *values.values(), points=SERIES_POINTS)
+    rows = extremes(*(speed[steps] for speed in speeds.values()), *values.values(), points=SERIES_POINTS)
     state = steps[rows]
     return {
         "step": packed_sums(rows, unit=1),
@@ -210,7 +210,7 @@ def _models_data(
         }
         for name, (heading, place) in paths.items()
     }
-    report_rows = rows_of(one.name for one in report.models)
+    report_rows = rows_of(model.name for model in report.models)
     driven = {name: row for name, row in report_rows.items() if name in paths or name == "icr"}
     shown_names = shown_rows(list(report_rows))
     models = [
@@ -266,18 +266,18 @@ def _fitted(name: str, fits: Mapping[str, FitDocument]) -> FittedModel:
 def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Paths:
     """Yield the path of each calibration that was given; with the gyro too where there is one."""
     recording = recording_of("gyro") if report.calibrations else None
-    for one in report.calibrations:
-        turned, document = one.with_gyro, one.calibration
+    for used in report.calibrations:
+        turned, document = used.with_gyro, used.calibration
         if recording is not None and document and not (turned and recording.track.gyro is None):
             with suppress(DataError):
                 tested = calibrated_drive(
-                    stored_calibration(document), recording, one.name, with_gyro=turned,
+                    stored_calibration(document), recording, used.name, with_gyro=turned,
                     refit_sensors=report.request.refit_sensors,
                 )  # fmt: skip
                 # one path for all starts: with the bias of the gyro as known at the end
                 last_learned = tested.drive.learned[-1]
                 yield (
-                    one.name,
+                    used.name,
                     predicted_path(recording, last_learned.fitted, last_learned.constants)(recording.track.t[rows]),
                 )
 

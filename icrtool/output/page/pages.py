@@ -109,7 +109,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     if not coordinates:
         # Without the datum, coordinates relative to it do not show the place.
         metric = summary.gnss.datum is None
-        pictures = {name: one for name, one in pictures.items() if not (metric and one.with_place)}
+        pictures = {name: picture for name, picture in pictures.items() if not (metric and picture.with_place)}
         summary, report_document = without_place(run, report)
     compared = with_smoothed_reference(run) if report.request.reference == "smoothed" else run
     begun = f"{datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
@@ -122,12 +122,12 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
         f"icrtool {summary.tool_version}, {summary.schema}, {report.schema}; {report.starts:,} states; "
         f"intervals by {report.intervals.method}"
     )
-    provenance = [("log", f"{one.path}: {one.bytes:,} bytes, sha256 {one.sha256}") for one in summary.inputs]
+    provenance = [("log", f"{file.path}: {file.bytes:,} bytes, sha256 {file.sha256}") for file in summary.inputs]
     made_from = Section("Provenance", [Facts([*provenance, ("place", place), ("made with", made_with)])], PAGE)
     about = "From it icrtool learned how the robot slips, and tested how far wheel speeds alone keep the position."
     if not with_verdict(summary, report_document).usable:
         about = "How the robot slips when it turns could not be learned from this drive."
-    rows = rows_of(one.name for one in report.models)
+    rows = rows_of(model.name for model in report.models)
     meanings = {name: f"{row.words}; learned from {row.knows}" for name, row in rows.items()}
     words = Section("ICR, recommended, no_slip, trial, σ …", [Facts(list((meanings | GLOSSARY).items()))], PAGE)
     blocks = [
@@ -150,21 +150,21 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     summary = with_verdict(summary, report)
     rows = [
         (
-            one.kind, duration_text(one.begin_s), duration_text(one.end_s - one.begin_s),
-            distance_text(one.distance_m), f"{100 * one.severity:.0f} %",
+            event.kind, duration_text(event.begin_s), duration_text(event.end_s - event.begin_s),
+            distance_text(event.distance_m), f"{100 * event.severity:.0f} %",
         )
-        for one in summary.events
+        for event in summary.events
     ]  # fmt: skip
     head = ("kind", "from", "lasts", "distance", "missing motion")
     caption = "Slip events: the robot did not move as its wheels did"
-    events = Table("lr", rows, head, caption, [one.begin_s for one in summary.events])
+    events = Table("lr", rows, head, caption, [event.begin_s for event in summary.events])
     drive = [
         Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive", drive_charts(position_word(summary))),
         Section("", [events], PAGE), *outage_blocks(report), Figure(("icr_clusters", "outages")),
     ]  # fmt: skip
-    warnings = [one.text for one in summary.notes if not is_grave(one)]
+    warnings = [finding.text for finding in summary.notes if not is_grave(finding)]
     return [
-        unusable_line(summary), *(f"What to do: {one}" for one in (next_step(summary),) if one),
+        unusable_line(summary), *(f"What to do: {step}" for step in (next_step(summary),) if step),
         Section("Answer", _cards(summary, report), name="answer"),
         controller_section(report),
         Section("The drive", drive, name="drive"),
@@ -177,14 +177,14 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
 def _cards(summary: RunDocument, report: DropoutDocument) -> list[Section]:
     """Return the answer as cards, the drive from above in the last one."""
     cards = []
-    for one in answer_sections(summary, report):
+    for section in answer_sections(summary, report):
         blocks = [
-            block._replace(caption="") if isinstance(block, Table) and block.caption == one.title else block
-            for block in one.blocks
+            block._replace(caption="") if isinstance(block, Table) and block.caption == section.title else block
+            for block in section.blocks
         ]
         # The checks below it are the reasons for care; only a change of ground is not among them.
-        care = one.name == "trust" and one.grade == "care"
-        cards.append(one._replace(blocks=blocks, text=summary.partly_because or "" if care else one.text))
+        care = section.name == "trust" and section.grade == "care"
+        cards.append(section._replace(blocks=blocks, text=summary.partly_because or "" if care else section.text))
     up = "The drive from above, north up" if summary.gnss.datum is not None else "The drive from above"
     marks = f"{up}; ○ start, ■ end{', red: the trial with the largest error' if report.worst else ''}."
     drawing = Figure((), "sketch", (Chart("sketch", up, marks),))
@@ -195,11 +195,11 @@ def _cards(summary: RunDocument, report: DropoutDocument) -> list[Section]:
 
 def _settings(summary: RunDocument) -> list[Section]:
     """Return the sections with the choice of streams, the findings about them, and the configuration of a run."""
-    why: list[Block] = [Facts([(role_word(summary, one.role), one.why) for one in summary.streams])]
+    why: list[Block] = [Facts([(role_word(summary, stream.role), stream.why) for stream in summary.streams])]
     alignment = []
-    for name, one in summary.alignment.items():
-        value, applied = plus_minus(one.value, one.std, 4, ""), plus_minus(one.applied or None, None, 4, "")
-        alignment.append((name, value, applied, one.why))
+    for name, finding in summary.alignment.items():
+        value, applied = plus_minus(finding.value, finding.std, 4, ""), plus_minus(finding.applied or None, None, 4, "")
+        alignment.append((name, value, applied, finding.why))
     caption = "Alignment of the streams: what was found and corrected"
     why.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
     return [
@@ -267,7 +267,7 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, Dropo
     report_notes = report.notes
     if cause:
         notes, report_notes = (
-            tuple(changed(one, text=one.text.replace(cause, "its cause is left out")) for one in some)
+            tuple(changed(finding, text=finding.text.replace(cause, "its cause is left out")) for finding in some)
             for some in (notes, report_notes)
         )
     document_without = changed(
@@ -278,7 +278,7 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, Dropo
         gnss=changed(document.gnss, datum=None if datum is None else (math.nan, math.nan, math.nan)),
         heading=changed(document.heading, offset_name=None, magnetic_declination_deg=None, utm_convergence_deg=None),
     )
-    moved = (changed(one, north_m=one.north_m - north, east_m=one.east_m - east) for one in report.worst)
+    moved = (changed(trial, north_m=trial.north_m - north, east_m=trial.east_m - east) for trial in report.worst)
     return document_without, changed(report, worst=tuple(moved), notes=report_notes, warnings=warnings_of(report_notes))
 
 
@@ -312,24 +312,36 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
 
 def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
     """Return the table of the calibration from all logs of each robot."""
-    grouped = any(one.group for one in calibrations)
+    grouped = any(calibration.group for calibration in calibrations)
     rows: list[list[str | Cell]] = []
-    incomplete, labels = any(one.left_out for one in calibrations), {name: one.label for name, one in MODELS.items()}
-    for one in calibrations:
-        numbers = [Cell(one.reason), Cell("")]
-        if one.multiplier is not None:
-            far = one.within
+    incomplete, labels = (
+        any(calibration.left_out for calibration in calibrations),
+        {name: model.label for name, model in MODELS.items()},
+    )
+    for calibration in calibrations:
+        numbers = [Cell(calibration.reason), Cell("")]
+        if calibration.multiplier is not None:
+            far = calibration.within
             _, distance, _, between = ("", "–", "", "") if far is None else reach_row(far)
             numbers = [
-                Cell(f"{one.multiplier:.3f}", f"± {one.multiplier_std:.3f}"),
+                Cell(f"{calibration.multiplier:.3f}", f"± {calibration.multiplier_std:.3f}"),
                 Cell(distance, more=(between,) if between else ()),
             ]
-        icrs = ", ".join(map(signed, one.icrs_m))
-        group_cell = [one.group] if grouped else []
-        left_out = [", ".join(one.left_out)] if incomplete else []
-        model = labels.get(one.recommended, one.recommended)
+        icrs = ", ".join(map(signed, calibration.icrs_m))
+        group_cell = [calibration.group] if grouped else []
+        left_out = [", ".join(calibration.left_out)] if incomplete else []
+        model = labels.get(calibration.recommended, calibration.recommended)
         rows.append(
-            [one.robot or "all logs", *numbers, *group_cell, f"{len(one.logs)}", icrs, model, one.file, *left_out]
+            [
+                calibration.robot or "all logs",
+                *numbers,
+                *group_cell,
+                f"{len(calibration.logs)}",
+                icrs,
+                model,
+                calibration.file,
+                *left_out,
+            ]
         )
     group, omitted = ("group",) if grouped else (), ("left out",) if incomplete else ()
     head = ("robot", "multiplier", "within 0.5 m (95 %)", *group, "logs", "ICRs right, left, x [m]",
@@ -449,14 +461,16 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
 
     names, labels = list(comparison.groups), {name: model.label for name, model in MODELS.items()}
     groups = "; ".join(
-        f"{name}: {counted(len(one.logs), 'log')}, {labels.get(one.model, one.model)}"
-        for name, one in comparison.groups.items()
+        f"{name}: {counted(len(group.logs), 'log')}, {labels.get(group.model, group.model)}"
+        for name, group in comparison.groups.items()
     )
     # The errors in the runs of each group over distance, by the group of the calibration.
     by_group: list[dict[str, object]] = []
     looks = rows_of(f"calibration:{name}" for name in names)
     for tested_on in names:
-        rows = {(one.calibrated_on, one.horizon_m): one for one in comparison.transfer if one.tested_on == tested_on}
+        rows = {
+            (cell.calibrated_on, cell.horizon_m): cell for cell in comparison.transfer if cell.tested_on == tested_on
+        }
         horizons = sorted({horizon_m for _, horizon_m in rows})
         models = [
             {
@@ -470,12 +484,16 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
         ]
         by_group.append({"horizons_m": horizons, "models": models, "reference": {"p95": [], "expected": []}})
     # the chart begins with the group in whose runs a foreign calibration costs most
-    costs = [one for one in comparison.costs if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None]
-    dearest = max(costs or comparison.costs, key=lambda one: one.p95_m or 0.0, default=None)
+    costs = [cost for cost in comparison.costs if cost.horizon_m == CHOICE_HORIZON_M and cost.p95_m is not None]
+    dearest = max(costs or comparison.costs, key=lambda cost: cost.p95_m or 0.0, default=None)
     verdict = comparison_title(comparison)
-    sections = [one for one in transfer_blocks(comparison) if len(comparison.pairs) > 1 or not isinstance(one, str)]
-    sections = [_comparison_answer(comparison, one) if isinstance(one, Section) and one.name == "verdict" else one
-                for one in sections]  # fmt: skip
+    sections = [
+        block for block in transfer_blocks(comparison) if len(comparison.pairs) > 1 or not isinstance(block, str)
+    ]
+    sections = [
+        _comparison_answer(comparison, block) if isinstance(block, Section) and block.name == "verdict" else block
+        for block in sections
+    ]
     return render(
         (*VENDOR, "columns.js", "charts.js", "comparison.js"), {"by_group": by_group}, title=title,
         kind=f"Drive without GNSS: groups of runs compared ({title})",
@@ -488,11 +506,11 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
 def _comparison_answer(found: GroupComparison, verdict: Section) -> Section:
     """Return the errors of the groups and their differences as cards, with the verdicts."""
     at = f"after {CHOICE_HORIZON_M:g} m"
-    own = (one for one in found.transfer if one.calibrated_on == one.tested_on)
-    rows = [_row_of_errors(one.tested_on, one, "") for one in own if one.horizon_m == CHOICE_HORIZON_M]
+    own = (cell for cell in found.transfer if cell.calibrated_on == cell.tested_on)
+    rows = [_row_of_errors(cell.tested_on, cell, "") for cell in own if cell.horizon_m == CHOICE_HORIZON_M]
     for pair in found.pairs:
-        at_choice = (one for one in pair.errors if one.horizon_m == CHOICE_HORIZON_M)
-        rows += [_row_of_errors(f"{pair.second} − {pair.first}", one, "+") for one in at_choice]
+        at_choice = (difference for difference in pair.errors if difference.horizon_m == CHOICE_HORIZON_M)
+        rows += [_row_of_errors(f"{pair.second} − {pair.first}", difference, "+") for difference in at_choice]
     errors = Table("lrr", [row for row in rows if row[1]], (f"95 % error {at}", "error", "95 % interval"))
     chart = Chart("groups", f"95 % error {at} of each group", f"95 % error {at} of each group, with 95 % interval.")
     cards = [
@@ -503,13 +521,13 @@ def _comparison_answer(found: GroupComparison, verdict: Section) -> Section:
     return Section("Answer", cards, name="answer")
 
 
-def _row_of_errors(name: str, one: ErrorsAt, sign: str) -> tuple[str, str, str]:
+def _row_of_errors(name: str, error: ErrorsAt, sign: str) -> tuple[str, str, str]:
     """Return a name, its 95 % error, and the interval; empty texts for what is not known."""
-    if one.p95_m is None:
+    if error.p95_m is None:
         return name, "", ""
-    known = one.p95_low_m is not None and one.p95_high_m is not None
-    interval = f"{one.p95_low_m:{sign}z.2f} to {one.p95_high_m:{sign}z.2f} m" if known else "too short"
-    return name, f"{one.p95_m:{sign}z.2f} m", interval
+    known = error.p95_low_m is not None and error.p95_high_m is not None
+    interval = f"{error.p95_low_m:{sign}z.2f} to {error.p95_high_m:{sign}z.2f} m" if known else "too short"
+    return name, f"{error.p95_m:{sign}z.2f} m", interval
 
 
 def comparison_in(place: Path) -> Place | None:

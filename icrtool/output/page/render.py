@@ -64,7 +64,7 @@ def render(
     code = [BEGIN, *(_static(name) for name in scripts)]
     # Hashes in the form in which a content security policy names a style or a script.
     of_style, *of_scripts = (
-        f"'sha256-{b64encode(sha256(one.encode()).digest()).decode('ascii')}'" for one in (style, *code)
+        f"'sha256-{b64encode(sha256(text.encode()).digest()).decode('ascii')}'" for text in (style, *code)
     )
     policy = (
         f"default-src 'none'; img-src data:; style-src {of_style}; "
@@ -74,7 +74,7 @@ def render(
     written = json.dumps(plain_value(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
     return _environment().get_template("base.html").render(
         # Texts of icrtool, not of a log: they are not escaped.
-        policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(one) for one in code[1:]],  # noqa: S704
+        policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(script) for script in code[1:]],  # noqa: S704
         data=None if data is None else Markup(written),  # noqa: S704 - escaped for a script element
         tool_version=__version__, title=title, kind=kind, blocks=list(stated_blocks(blocks)),
         **{"pictures": {}, **content},
@@ -107,7 +107,7 @@ def _environment() -> Environment:
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}",
         "grouped": _grouped,
         "kind": lambda block: type(block).__name__,
-        "named": lambda pictures, names: [one for name, one in pictures.items() if name.startswith(names)],
+        "named": lambda pictures, names: [picture for name, picture in pictures.items() if name.startswith(names)],
     }
     return environment
 

@@ -164,20 +164,20 @@ ROW_HEIGHT, TICKS = 44.0, 4.0
 def group_sketch(found: GroupComparison) -> GroupErrors:
     """Return the 95 % errors of the groups at `CHOICE_HORIZON_M`, each by its own calibration, with 95 % intervals."""
     own = [
-        one
-        for one in found.transfer
-        if one.horizon_m == CHOICE_HORIZON_M and one.calibrated_on == one.tested_on and one.p95_m is not None
+        cell
+        for cell in found.transfer
+        if cell.horizon_m == CHOICE_HORIZON_M and cell.calibrated_on == cell.tested_on and cell.p95_m is not None
     ]
-    end_m = max((one.p95_high_m or one.p95_m or 0.0 for one in own), default=0.0) or 1.0
-    step_m = float(min(round_steps(end_m / TICKS), key=lambda one: abs(one - end_m / TICKS)))
+    end_m = max((cell.p95_high_m or cell.p95_m or 0.0 for cell in own), default=0.0) or 1.0
+    step_m = float(min(round_steps(end_m / TICKS), key=lambda step: abs(step - end_m / TICKS)))
     scale = (WIDTH - 3.0 * MARGIN) / end_m
     rows = []
-    for number, one in enumerate(own):
+    for number, cell in enumerate(own):
         low, x, high = (
             None if error is None else round(MARGIN + scale * error, 1)
-            for error in (one.p95_low_m, one.p95_m, one.p95_high_m)
+            for error in (cell.p95_low_m, cell.p95_m, cell.p95_high_m)
         )
-        rows.append(GroupError(one.tested_on, x or MARGIN, low, high, ROW_HEIGHT * (number + 0.75)))
+        rows.append(GroupError(cell.tested_on, x or MARGIN, low, high, ROW_HEIGHT * (number + 0.75)))
     counts = range(math.floor(end_m / step_m) + 1)
     ticks = tuple((round(MARGIN + scale * step_m * count, 1), f"{step_m * count:g}") for count in counts)
     return GroupErrors(tuple(rows), ticks, WIDTH, ROW_HEIGHT * len(rows) + 3.0 * MARGIN)

@@ -59,7 +59,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
         parameter_table(calibration.fitted, calibration.fitted_with_gyro),
         *held_out_blocks(table),
         *sensor_tables(calibration),
-        *(one.sentence for one in result.notes),
+        *(finding.sentence for finding in result.notes),
     ]
     return [
         Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
@@ -100,11 +100,11 @@ def calibration_file_blocks(calibration: Calibration, title: str) -> list[Block]
         Facts([("not shown", unknown and f"too small for these drives; the usual values are used: {unknown}")]),
         *sensor_tables(calibration),
     ]
-    unfit = [one.text for one in unfit_reasons(calibration)]
+    unfit = [reason.text for reason in unfit_reasons(calibration)]
     head = ("log", "distance", "begins", "heading offset", "poses lag")
     logs = [
-        (one.name, distance_text(one.distance_m), _date_text(one.begin_ns), *_log_constants(one))
-        for one in calibration.logs
+        (log.name, distance_text(log.distance_m), _date_text(log.begin_ns), *_log_constants(log))
+        for log in calibration.logs
     ]
     return [
         Line(f"Not fit for use: {'; '.join(unfit)}" if unfit else "", "bad"),
@@ -154,9 +154,9 @@ def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) 
 
 def _reach_card(found: Calibration) -> Section:
     """Return the distance within the budget and the errors, both held out of the fit, as a card."""
-    horizons = sorted({one.horizon_m for one in found.held_out_pooled})
-    pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
-    names = in_order({one.model for one in found.held_out_pooled})
+    horizons = sorted({score.horizon_m for score in found.held_out_pooled})
+    pooled = {(score.model, score.horizon_m): score for score in found.held_out_pooled}
+    names = in_order({score.model for score in found.held_out_pooled})
     what = "each log left out in turn" if len(found.logs) > 1 else "each block of distance left out in turn"
     reached: dict[str, BudgetDistance] = {}
     for name in names:
@@ -178,9 +178,9 @@ def _reach_card(found: Calibration) -> Section:
 
 def _held_out_table(found: Calibration) -> Table:
     """Return p95 and expected error by horizon of each row, over all held-out trials."""
-    horizons = sorted({one.horizon_m for one in found.held_out_pooled})
-    pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
-    names = in_order({one.model for one in found.held_out_pooled})
+    horizons = sorted({score.horizon_m for score in found.held_out_pooled})
+    pooled = {(score.model, score.horizon_m): score for score in found.held_out_pooled}
+    names = in_order({score.model for score in found.held_out_pooled})
     rows = [(name, *(_errors_text(pooled.get((name, horizon))) for horizon in horizons)) for name in names]
     caption = "95 % / expected error [m] of each row, over all that was left out"
     return Table("lr", rows, ("row", *(f"{horizon:g} m" for horizon in horizons)), caption)
@@ -188,9 +188,9 @@ def _held_out_table(found: Calibration) -> Table:
 
 def _left_out_table(calibration: Calibration) -> Table:
     """Return p95 and expected error by horizon of each log or block, predicted by a fit without it."""
-    horizons = sorted({one.horizon_m for one in calibration.held_out_pooled})
-    each = {(one.log, one.horizon_m): one for one in calibration.held_out if one.model == MAIN_ROW}
-    names = dict.fromkeys(one.log for one in calibration.held_out)
+    horizons = sorted({score.horizon_m for score in calibration.held_out_pooled})
+    each = {(score.log, score.horizon_m): score for score in calibration.held_out if score.model == MAIN_ROW}
+    names = dict.fromkeys(score.log for score in calibration.held_out)
     rows = [(name, *(_errors_text(each.get((name, horizon))) for horizon in horizons)) for name in names]
     caption = f"95 % / expected error [m] of {MAIN_ROW}, each log or block of distance predicted without itself"
     return Table("lr", rows, ("left out", *(f"{horizon:g} m" for horizon in horizons)), caption)
@@ -242,15 +242,15 @@ def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
         ("compared", f"{calibration.windows} windows of driven distance, {stretches}"),
     ]
     rows = []
-    for key, one in calibration.parameters.items():
+    for key, parameter in calibration.parameters.items():
         digits, sign, unit = next(form for ending, form in FORMS.items() if key.endswith(ending))
-        value = plus_minus(one.value, one.std if one.verdict != "given" else None, digits, sign)
-        value += unit if one.value is not None else ""
-        rows.append((LABELS[key], value, one.verdict + (f": {one.note}" if one.note else "")))
+        value = plus_minus(parameter.value, parameter.std if parameter.verdict != "given" else None, digits, sign)
+        value += unit if parameter.value is not None else ""
+        rows.append((LABELS[key], value, parameter.verdict + (f": {parameter.note}" if parameter.note else "")))
     table = Table("lrl", rows, ("parameter", "value ± std", "verdict"))
     estimates = Section(calibration.log, [Facts(head), table, MEANINGS, ""], VERBOSE)
     if not calibration.settings:
-        shown = any(one.verdict == "shown" for one in calibration.parameters.values())
+        shown = any(parameter.verdict == "shown" for parameter in calibration.parameters.values())
         why = "the drive confirms the configuration" if shown else "the drive showed nothing well enough"
         return [estimates, f"nothing to configure: {why}"]
     # an option and its value stay together
@@ -330,7 +330,7 @@ def forecast_blocks(
     rows = []
     for metres in sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)}):
         k = int(metres) - 1
-        errors = [f"{column[k]:.2f}" for _, one in kinds for column in (one.expected_m, one.p95_m)]
+        errors = [f"{column[k]:.2f}" for _, along in kinds for column in (along.expected_m, along.p95_m)]
         rows.append((f"{metres:g}", *errors, f"{forecast.heading_std_deg[k]:.1f}"))
     head = [f"{name}{kind} [m]" for kind, _ in kinds for name in ("expected", "95 %")]
     blocks: list[Block] = [
@@ -340,14 +340,14 @@ def forecast_blocks(
         "",
     ]
     for budget in budgets_m:
-        far = [(kind, distance_within(one, budget)) for kind, one in kinds]
+        far = [(kind, distance_within(along, budget)) for kind, along in kinds]
         reached = [f"{'all of it' if metres >= total else f'{metres:.1f} m'}{kind}" for kind, metres in far]
         blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
     if total > (longest := measured_to_m(calibration)):
         blocks.append(f"errors were measured up to {longest:g} m; what is beyond is extrapolated")
     if unknown := "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown):
         blocks.append(f"not found by the calibration, too small or not driven: {unknown}")
-    return [*blocks, *(one.sentence for one in calibration.notes)]
+    return [*blocks, *(finding.sentence for finding in calibration.notes)]
 
 
 def transfer_csv(comparison: documents.GroupComparison) -> bytes:
@@ -360,9 +360,9 @@ def transfer_blocks(comparison: documents.GroupComparison) -> list[Block]:
     """Return the output of `icrtool compare`: verdicts, the transfer matrix, differences of each pair, the logs."""
     names = list(comparison.groups)
     cells = dict.fromkeys(product(names, names), "-")
-    for one in comparison.transfer:
-        if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None and one.expected_m is not None:
-            cells[one.calibrated_on, one.tested_on] = f"{one.p95_m:.2f} / {one.expected_m:.2f}"
+    for cell in comparison.transfer:
+        if cell.horizon_m == CHOICE_HORIZON_M and cell.p95_m is not None and cell.expected_m is not None:
+            cells[cell.calibrated_on, cell.tested_on] = f"{cell.p95_m:.2f} / {cell.expected_m:.2f}"
     matrix = [(row, *(cells[row, column] for column in names)) for row in names]
     caption = f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column"
     chart = (
@@ -377,7 +377,7 @@ def transfer_blocks(comparison: documents.GroupComparison) -> list[Block]:
         "on the diagonal each trial is predicted by a fit that does not contain it",
     ]
     logs = [
-        f"{name}: {one.name}, {distance_text(one.distance_m)}" for name in names for one in comparison.groups[name].logs
+        f"{name}: {log.name}, {distance_text(log.distance_m)}" for name in names for log in comparison.groups[name].logs
     ]
     return [
         *(change_sentence(pair, comparison) for pair in comparison.pairs),
@@ -418,8 +418,8 @@ def change_of(pair: documents.ComparedPair, comparison: documents.GroupCompariso
     """
     drives = sum(len(comparison.groups[name].logs) for name in (pair.first, pair.second))
     of_drives = f"with these {counted(drives, 'drive')}"
-    measured = (one for one in pair.errors if None not in (one.p95_m, one.p95_low_m, one.p95_high_m))
-    row = min(measured, key=lambda one: abs(one.horizon_m - CHOICE_HORIZON_M), default=None)
+    measured = (error for error in pair.errors if None not in (error.p95_m, error.p95_low_m, error.p95_high_m))
+    row = min(measured, key=lambda error: abs(error.horizon_m - CHOICE_HORIZON_M), default=None)
     names = f"{pair.second} against {pair.first}"
     if row is None or row.p95_m is None or row.p95_low_m is None or row.p95_high_m is None:
         why = "the drives are too short for an interval of the difference"
@@ -464,16 +464,19 @@ QUANTITY_WORDS = {
 def _pair_section(pair: documents.ComparedPair, place: str) -> Section:
     """Return how parameters and held-out errors of two groups differ; `place`: name of its place on a page."""
     rows, errors = [], []
-    for one in pair.parameters:
-        values = (f"{value:+z.3f}" for value in (one.first, one.second))
-        word, shown = QUANTITY_WORDS.get(one.quantity, one.quantity), "yes" if one.significant else "no"
-        rows.append((word, *values, with_std(one.difference, one.std, 3), shown))
+    for parameter in pair.parameters:
+        values = (f"{value:+z.3f}" for value in (parameter.first, parameter.second))
+        word, shown = (
+            QUANTITY_WORDS.get(parameter.quantity, parameter.quantity),
+            "yes" if parameter.significant else "no",
+        )
+        rows.append((word, *values, with_std(parameter.difference, parameter.std, 3), shown))
     for row in pair.errors:
         if row.p95_m is not None and row.expected_m is not None:
             p95 = with_interval(row.p95_m, row.p95_low_m, row.p95_high_m)
             expected = with_interval(row.expected_m, row.expected_low_m, row.expected_high_m)
             errors.append((f"{row.horizon_m:g} m", p95, expected))
-    route = ", the same route" if any(one.paired for one in pair.errors) else ""
+    route = ", the same route" if any(error.paired for error in pair.errors) else ""
     caption = f"Error of a fit to other trials, {pair.second} minus {pair.first}{route}, with its 95 % interval"
     head = ("quantity", pair.first, pair.second, "difference ± σ", "shown")
     by_chance = "Parameters; a difference that is not shown may be chance (zero lies in its 95 % interval)"

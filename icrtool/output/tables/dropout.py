@@ -87,7 +87,9 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     summary = with_verdict(summary, report)
     # Number of trials of the first row, at the horizon with trials that is nearest to `CHOICE_HORIZON_M`.
     counts = zip(report.trials, trials_of_first(report), strict=True)
-    row, count = min(counts, key=lambda one: (not one[1], abs(one[0].horizon_m - CHOICE_HORIZON_M)))
+    row, count = min(
+        counts, key=lambda row_and_trials: (not row_and_trials[1], abs(row_and_trials[0].horizon_m - CHOICE_HORIZON_M))
+    )
     trials = f"{distance_text(report.run.drive.distance_m)}, {count:,} trials of {row.horizon_m:g} m"
     return [
         unusable_line(summary),
@@ -114,12 +116,12 @@ def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Secti
         unknown = Section("How far without GNSS?", ["Not known: the run is not usable."], VERBOSE, name="reach")
         return [unknown, trust_section(summary, report)._replace(depth=VERBOSE)]
     cards = [reach_section(summary, report), numbers_section(summary, report), trust_section(summary, report)]
-    for one in report.worst[:1]:
-        note = _meanwhile(one, summary, report)
-        driven = f"{one.horizon_m:g} m from {duration_text(one.t_s)} on"
-        turned = f"turning {turn_text(one.heading_change_deg)} at {one.speed_mean_mps:.2f} m/s"
-        by = f"with {one.model}{f'; meanwhile: {note}' if note else ''}"
-        error = error_text(one.errors_m[one.model])
+    for trial in report.worst[:1]:
+        note = _meanwhile(trial, summary, report)
+        driven = f"{trial.horizon_m:g} m from {duration_text(trial.t_s)} on"
+        turned = f"turning {turn_text(trial.heading_change_deg)} at {trial.speed_mean_mps:.2f} m/s"
+        by = f"with {trial.model}{f'; meanwhile: {note}' if note else ''}"
+        error = error_text(trial.errors_m[trial.model])
         text = f"after {driven}, {turned}, {by}"
         cards.append(Section("Where was it worst?", [], lead=error, text=text, label="Worst", name="worst-case"))
     return cards
@@ -132,15 +134,15 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
     ----------
     events : slip events of the run; the last row is the distance without them, where that is known
     """
-    by_model = {one.model: one for one in report.budgets if one.budget_m == budget_m}
+    by_model = {reach.model: reach for reach in report.budgets if reach.budget_m == budget_m}
     best = report.best.model if report.best is not None else MAIN_ROW
     order = in_order(by_model)
     first = sorted(shown_rows(order), key=lambda name: name != best)
-    notes = {one.name: one.fitted for one in report.calibrations}
-    notes |= {one.name: one.knows for one in report.models if kind_of(one.name) == TOPIC_ROW}
+    notes = {used.name: used.fitted for used in report.calibrations}
+    notes |= {model.name: model.knows for model in report.models if kind_of(model.name) == TOPIC_ROW}
     # a given calibration changes the numbers of this row
-    learned = (one for one in report.models if kind_of(one.name) == "adaptive")
-    notes |= {one.name: "from the calibration" for one in learned if not one.knows.startswith(OTHER_ROBOTS)}
+    learned = (model for model in report.models if kind_of(model.name) == "adaptive")
+    notes |= {model.name: "from the calibration" for model in learned if not model.knows.startswith(OTHER_ROBOTS)}
     if report.best is not None:
         notes[best] = "best by wheels"
         notes |= dict.fromkeys(report.best.as_good, "as good here")
@@ -166,7 +168,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
     blocks: list[Block] = []
     lead, text = "", ""
     others_known = list(other_ground_lines(report))
-    for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
+    for budget_m in dict.fromkeys(reach.budget_m for reach in report.budgets):
         rows, others = reach_rows(report, budget_m, len(summary.events))
         if rows and not lead:
             lead, text = _distance_to_plan_with(report, budget_m, rows[0])
@@ -192,7 +194,7 @@ def _distance_to_plan_with(report: DropoutDocument, budget_m: float, row: ReachR
     """
     name, this_drive, next_drive, _ = row
     measured = f"within {budget_m:g} m (95 %), by wheel speeds alone with {name}"
-    found = next((one for one in report.budgets if (one.model, one.budget_m) == (name, budget_m)), None)
+    found = next((reach for reach in report.budgets if (reach.model, reach.budget_m) == (name, budget_m)), None)
     if found is None or found.to_plan_with_m is None:
         return this_drive, f"on this drive {measured}"
     then = f"{next_drive} on the next drive on this ground (9 of 10), {this_drive} on this drive"
@@ -207,11 +209,11 @@ def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
         if used.calibration is not None
         for score in used.calibration.other_grounds or ()
     }
-    for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
-        distances = [one for one in report.budgets if one.budget_m == budget_m and one.other_text]
-        wheels = [one for one in distances if not turned_by(one.model)]
+    for budget_m in dict.fromkeys(reach.budget_m for reach in report.budgets):
+        distances = [reach for reach in report.budgets if reach.budget_m == budget_m and reach.other_text]
+        wheels = [reach for reach in distances if not turned_by(reach.model)]
         if wheels:
-            best = max(wheels, key=lambda one: math.inf if one.other_low_m is None else one.other_low_m or 0.0)
+            best = max(wheels, key=lambda reach: math.inf if reach.other_low_m is None else reach.other_low_m or 0.0)
             of_budget = f"{best.other_text} within {budget_m:g} m (9 of 10) with {best.model}"
             yield f"on another ground: {of_budget}; from {counted(len(grounds), 'ground')}, each left out once"
 
@@ -227,7 +229,7 @@ def heading_lines(report: DropoutDocument) -> Iterator[str]:
 
 def sensor_lines(report: DropoutDocument) -> Iterator[str]:
     """Yield a line for each constant of a calibration's sensors that the log contradicts."""
-    return (one.sentence for one in report.notes if one.code == SENSORS_CONTRADICT)
+    return (finding.sentence for finding in report.notes if finding.code == SENSORS_CONTRADICT)
 
 
 def as_good_lines(report: DropoutDocument) -> Iterator[str]:
@@ -239,7 +241,7 @@ def as_good_lines(report: DropoutDocument) -> Iterator[str]:
 def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
     """Return whether the numbers of a report can be trusted, the reasons for care, and what was checked."""
     checks = run_checks(summary)
-    cares = [f"{one.what} {one.text}" for one in checks if one.grade == "care" and one.what != "slip events"]
+    cares = [f"{check.what} {check.text}" for check in checks if check.grade == "care" and check.what != "slip events"]
     if summary.partly_because:
         cares.insert(0, summary.partly_because)
     if events := summary.events:
@@ -249,15 +251,15 @@ def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
     lead, why = ("yes, with care:" if cares else "yes"), "; ".join(cares)
     if not (summary.usable and report.passed):
         grade, lead, why = "bad", "no:", summary.unusable_because or "an acceptance limit is not met"
-    if count := sum(not is_grave(one) for one in summary.notes):
+    if count := sum(not is_grave(finding) for finding in summary.notes):
         checks.append(Check("care", "log", f"{counted(count, 'warning')} about it"))
-    section = Section("", [Checks(sorted(checks, key=lambda one: one.grade != "care"))], VERBOSE)
+    section = Section("", [Checks(sorted(checks, key=lambda check: check.grade != "care"))], VERBOSE)
     return Section("May I trust it?", [section], lead=lead, text=why, label="Trust?", grade=grade, name="trust")
 
 
 def verdict_lines(report: DropoutDocument) -> list[Line]:
     """Return the verdict on each acceptance limit."""
-    return [Line(one.verdict, "good" if one.passed else "bad") for one in report.gates]
+    return [Line(verdict.verdict, "good" if verdict.passed else "bad") for verdict in report.gates]
 
 
 def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
@@ -267,11 +269,11 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
     first = report.worst[0]
     rows = [
         (
-            f"{rank}", duration_text(one.t_s), error_text(one.errors_m[one.model]),
-            error_text(one.errors_m.get("no_slip")), turn_text(one.heading_change_deg), f"{one.speed_mean_mps:.2f} m/s",
-            f"{one.north_m:z.1f} m", f"{one.east_m:z.1f} m", _meanwhile(one, summary, report),
+            f"{rank}", duration_text(trial.t_s), error_text(trial.errors_m[trial.model]),
+            error_text(trial.errors_m.get("no_slip")), turn_text(trial.heading_change_deg),
+            f"{trial.speed_mean_mps:.2f} m/s", f"{trial.north_m:z.1f} m", f"{trial.east_m:z.1f} m", _meanwhile(trial, summary, report),
         )
-        for rank, one in enumerate(report.worst, start=1)
+        for rank, trial in enumerate(report.worst, start=1)
     ]  # fmt: skip
     across, up = (word.lower() for word in direction_words(summary))
     head = ("", "from", "error", "no_slip", "turn", "mean speed", up, across, "meanwhile")
@@ -279,7 +281,7 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
         f"Trials of {first.horizon_m:g} m with the largest error of {first.model} that do not "
         "overlap. What they share (a speed, a turn, a place) is where the model fails"
     )
-    moments = [one.t_s for one in report.worst]
+    moments = [trial.t_s for trial in report.worst]
     worst = Table("lrrrrrrrl", rows[:1], head, caption, moments[:1])
     further = Table("lrrrrrrrl", rows[1:], head, "", moments[1:])
     blocks: list[Block] = [
@@ -309,22 +311,22 @@ def outage_blocks(report: DropoutDocument) -> list[Block]:
     """Return the worst outage of each kind, and a table of all outages with p95 of trials over the same distance."""
     parts = []
     for kind in ("forced", "real"):
-        if ours := [one for one in report.outages if one.kind == kind]:
-            worst = max(ours, key=lambda one: one.end_error_m or 0.0)
+        if ours := [outage for outage in report.outages if outage.kind == kind]:
+            worst = max(ours, key=lambda outage: outage.end_error_m or 0.0)
             parts.append(
                 f"{len(ours)} {kind}, the worst {error_text(worst.end_error_m)} after {distance_text(worst.distance_m)}"
             )
     rows = [
         (
-            f"{number} {one.kind}", duration_text(one.begin_s), duration_text(one.end_s - one.begin_s),
-            distance_text(one.distance_m), error_text(one.end_error_m), error_text(one.max_error_m),
-            error_text(p95_at(report, "icr", one.distance_m)),
+            f"{number} {outage.kind}", duration_text(outage.begin_s), duration_text(outage.end_s - outage.begin_s),
+            distance_text(outage.distance_m), error_text(outage.end_error_m), error_text(outage.max_error_m),
+            error_text(p95_at(report, "icr", outage.distance_m)),
         )
-        for number, one in enumerate(report.outages, start=1)
+        for number, outage in enumerate(report.outages, start=1)
     ]  # fmt: skip
     head = ("outage", "from", "length", "distance", "end error", "max error", "95 % of trials")
     caption = "How far the filter was off when position fixes returned"
-    table = Table("lr", rows, head, caption, [one.begin_s for one in report.outages])
+    table = Table("lr", rows, head, caption, [outage.begin_s for outage in report.outages])
     return [Facts([("Outages", "; ".join(parts))]), Section("", [table], VERBOSE)]
 
 
@@ -342,9 +344,9 @@ def model_section(report: DropoutDocument) -> Section:
     if (recommended := report.recommended) is not None:
         parameters = [
             parameter_table(fitted_model(recommended.model, recommended)),
-            *(one.sentence for one in recommended.notes),
+            *(finding.sentence for finding in recommended.notes),
         ]
-    notes = [one.sentence for one in report.ladder.notes or ()]
+    notes = [finding.sentence for finding in report.ladder.notes or ()]
     blocks: list[Block] = [Section("Parameters of the motion model", parameters, VERBOSE), *notes]
     return Section("The motion model", blocks, VERBOSE, name="models")
 
@@ -356,10 +358,10 @@ WITH_GYRO = "with gyro: "
 def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:
     """Return the parameters of a model with one standard deviation each, and the parameters of its form with a gyro."""
     rows = [
-        (name if one is fitted else f"{WITH_GYRO}{name}", plus_minus(value, std, 4),
-         "not shown" if name in one.not_shown else "shown", TERMS[name].meaning)
-        for one in (fitted, gyro) if one is not None
-        for name, value, std in zip(one.model.terms, one.parameters, one.std, strict=True)
+        (name if model is fitted else f"{WITH_GYRO}{name}", plus_minus(value, std, 4),
+         "not shown" if name in model.not_shown else "shown", TERMS[name].meaning)
+        for model in (fitted, gyro) if model is not None
+        for name, value, std in zip(model.model.terms, model.parameters, model.std, strict=True)
     ]  # fmt: skip
     return Table("lrll", rows, ("term", "value ± σ", "by this drive", "meaning"))
 

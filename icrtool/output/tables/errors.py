@@ -46,18 +46,18 @@ def shown_horizons(horizons_m: Floats) -> list[int]:
 
 def model_of(report: DropoutDocument, name: str) -> ModelDocument | None:
     """Return a model of a report; None where it was not computed."""
-    return next((one for one in report.models if one.name == name), None)
+    return next((model for model in report.models if model.name == name), None)
 
 
 def in_row_order(models: Sequence[ModelDocument]) -> list[ModelDocument]:
     """Return models of a report in the order of `icrtool.records.rows`."""
-    by_name = {one.name: one for one in models}
+    by_name = {model.name: model for model in models}
     return [by_name[name] for name in in_order(by_name)]
 
 
 def trials_of_first(report: DropoutDocument) -> list[int]:
     """Return the number of trials of the row that is shown first, at each horizon of a report."""
-    first = shown_rows([one.name for one in report.models])[:1]
+    first = shown_rows([model.name for model in report.models])[:1]
     document = model_of(report, first[0]) if first else None
     return [row.trials for row in (report.trials if document is None else document.by_horizon)]
 
@@ -66,9 +66,9 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     """Return the errors over distance: of the shown rows, then of all rows, and the data behind them."""
     horizons = shown_horizons(np.array([row.horizon_m for row in report.trials]))
     counts = [report.trials[h] for h in horizons]
-    main, models = shown_rows([one.name for one in report.models]), in_row_order(report.models)
-    rows = [_error_row(one, horizons) for one in models if one.name in main]
-    others = [_error_row(one, horizons) for one in models if one.name not in main]
+    main, models = shown_rows([model.name for model in report.models]), in_row_order(report.models)
+    rows = [_error_row(model, horizons) for model in models if model.name in main]
+    others = [_error_row(model, horizons) for model in models if model.name not in main]
     trials = trials_of_first(report)
     rows.append(["trials", "", *(f"{trials[h]:,}" for h in horizons)])
     head = ("distance without GNSS", "", *(f"{row.horizon_m:g} m" for row in counts))
@@ -107,7 +107,9 @@ def _error_row(model: ModelDocument, horizons: Sequence[int]) -> list[str | Cell
 
 def _error_cell(horizon_m: float, p95_m: float | None, expected_m: float | None, *interval: str) -> Cell:
     """Return 95 % and the expected error, each with its share of the distance, and between them an interval."""
-    share, expected_share = ("-" if one is None else f"{100 * one / horizon_m:.1f} %" for one in (p95_m, expected_m))
+    share, expected_share = (
+        "-" if error_m is None else f"{100 * error_m / horizon_m:.1f} %" for error_m in (p95_m, expected_m)
+    )
     return Cell(error_text(p95_m), share, (*interval, f"{error_text(expected_m)} {expected_share:>7}"))
 
 
@@ -133,8 +135,8 @@ def _other_rows(report: DropoutDocument, horizons: Sequence[int]) -> Iterator[li
 def _source_lines(report: DropoutDocument) -> Iterator[str]:
     """Yield the data that each model was fitted to, and the part of its error that the reference can explain."""
     learned: dict[str, list[str]] = {}
-    for one in report.models:
-        learned.setdefault(one.knows, []).append(one.name)
+    for model in report.models:
+        learned.setdefault(model.knows, []).append(model.name)
     yield from (f"learned from {knows}: {', '.join(names)}" for knows, names in learned.items())
     for used in report.calibrations:
         yield f"{used.name}: {used.model} from {counted(used.logs, 'log')}, {used.created[:10]}, {used.fitted}"

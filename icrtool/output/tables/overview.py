@@ -113,11 +113,13 @@ def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator
     elif survey is not None:
         for role, sources in survey.candidates.items():
             used |= {sources[0].topic} if sources else set()
-            text = next((f"{one.topic}: {one.problem or one.why}" for one in sources), "no topic could be used")
+            text = next(
+                (f"{source.topic}: {source.problem or source.why}" for source in sources), "no topic could be used"
+            )
             yield ROLE_WORDS[role], text
     if survey is not None:
-        others = {one.topic for one in survey.topics} - {
-            topic_of_side(one) for name in used for one in name.split(" + ")
+        others = {topic.topic for topic in survey.topics} - {
+            topic_of_side(side) for name in used for side in name.split(" + ")
         }
         if others:
             yield "others", f"{counted(len(others), 'topic')} (-v names them, and why they are not used)"
@@ -127,16 +129,18 @@ def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | N
     """Yield each topic, the candidates of each role with the one that is used, and the time in which all overlap."""
     chosen = {stream.role: stream for stream in log.streams} if log is not None else {}
     if survey is not None:
-        rows = [(one.topic, one.message_type, _topic_text(one)) for one in survey.topics]
+        rows = [(topic.topic, topic.message_type, _topic_text(topic)) for topic in survey.topics]
         yield Section(f"Topics of {path}", [Table("l", rows) if rows else "  none"], VERBOSE)
     for role, word in ROLE_WORDS.items():
         stream, sources = chosen.get(role), survey.candidates[role] if survey is not None else ()
         blocks = ["  no candidate"] if survey is not None and not sources else []
-        for one in sources:
-            is_used = stream is not None and one.topic == stream.topic
+        for source in sources:
+            is_used = stream is not None and source.topic == stream.topic
             refused = "used although unsuitable, because it is configured" if is_used else "cannot be used"
-            finding = f"{refused}: {one.problem}" if one.problem else one.why
-            blocks.append(f"  {'*' if is_used else '-'} {one.topic} ({one.message_type}; {one.stamps}): {finding}")
+            finding = f"{refused}: {source.problem}" if source.problem else source.why
+            blocks.append(
+                f"  {'*' if is_used else '-'} {source.topic} ({source.message_type}; {source.stamps}): {finding}"
+            )
         if stream is not None:
             jitter = f", jitter {stream.jitter_ms:.3g} ms" if stream.jitter_ms is not None else ""
             blocks += [f"  -> {stream.topic}: {stream.why}"]
@@ -147,7 +151,7 @@ def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | N
     if (gyro := log.gyro) is not None:
         text = f"  -> {gyro.topic}: {len(gyro.stamp_ns)} turn rates, not used by the filter"
         yield Section("gyro", [text], VERBOSE)
-    spans = [one.stamp_ns for one in (log.wheels, log.gnss, log.heading)]
+    spans = [stream.stamp_ns for stream in (log.wheels, log.gnss, log.heading)]
     if all(map(len, spans)):
         overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9
         yield Section("", [f"all three overlap for {max(overlap, 0):.1f} s"], VERBOSE)

@@ -116,7 +116,7 @@ def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
     """Return the place of a run, and the next step; `examine` is the command that finds the problem of its log."""
     command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
     if (stretches := unstated_grounds(summary)) and summary.inputs:
-        times = [word for one in stretches[1:] for word in ("--terrain-change", f"{one.begin_s:.0f}")]
+        times = [word for stretch in stretches[1:] for word in ("--terrain-change", f"{stretch.begin_s:.0f}")]
         command = shlex.join(["icrtool", "fit", summary.inputs[0].path, *times])
     drive = next_step(summary)
     tested = summary.usable and not stretches
@@ -133,8 +133,9 @@ def unstated_grounds(summary: RunDocument) -> tuple[GroundStretch, ...]:
 def _stretch_rows(stretches: Sequence[GroundStretch]) -> list[Row]:
     """Return time and multiplier ± σ of stretches, two on a line."""
     rows = [
-        f"{one.begin_s:.0f} to {one.end_s:.0f} s: {one.multiplier:.3f} ± {max(one.multiplier_std, 0.001):.3f}"
-        for one in stretches
+        f"{stretch.begin_s:.0f} to {stretch.end_s:.0f} s: {stretch.multiplier:.3f}"
+        f" ± {max(stretch.multiplier_std, 0.001):.3f}"
+        for stretch in stretches
     ]
     return [("" if row else "multiplier", ", ".join(rows[row : row + 2])) for row in range(0, len(rows), 2)]
 
@@ -148,13 +149,13 @@ def next_step(summary: RunDocument) -> str:
     """Return what to check or to drive next, of a run that is not usable; empty where nothing is known to help."""
     if summary.usable:
         return ""
-    wrong = next((one.text for one in summary.notes if one.code == "wheel_scale_differs"), "")
+    wrong = next((finding.text for finding in summary.notes if finding.code == "wheel_scale_differs"), "")
     return wrong.partition(": ")[2] if scale_is_wrong(summary) else to_drive(summary)
 
 
 def scale_is_wrong(summary: RunDocument) -> bool:
     """Return whether a run must not be used because the wheel radius, or the unit of the wheels, is wrong."""
-    return any(one.code == "wheel_scale_wrong" for one in summary.notes)
+    return any(finding.code == "wheel_scale_wrong" for finding in summary.notes)
 
 
 def unusable_line(summary: RunDocument) -> Line:
@@ -164,7 +165,7 @@ def unusable_line(summary: RunDocument) -> Line:
 
 def warnings_line(notes: Sequence[Note]) -> str:
     """Return how many warnings there are, and what the first of the highest grade found; none: empty."""
-    count, first = sum(not is_grave(one) for one in notes), first_to_read(notes)
+    count, first = sum(not is_grave(finding) for finding in notes), first_to_read(notes)
     return f"{counted(count, 'warning')} (-v): {first.finding}" if first is not None else ""
 
 
@@ -252,8 +253,8 @@ def excitation_check(summary: RunDocument) -> Check:
         return Check("care" if drive else "good", "excitation", text, more)
     weak = [(excitation.verdict[name], ICR_WORDS[name]) for name in ICR_COLUMNS if excitation.verdict[name] != "shown"]
     words = "; ".join(
-        f"{', '.join(name for one, name in weak if one == verdict)} {verdict}"
-        for verdict in dict.fromkeys(one for one, _ in weak)
+        f"{', '.join(name for icr, name in weak if icr == verdict)} {verdict}"
+        for verdict in dict.fromkeys(icr_verdict for icr_verdict, _ in weak)
     )
     # The missing information is printed with the ICRs, and what to drive on a further line.
     lacks = drive.rpartition(": ")[2]
@@ -271,11 +272,11 @@ def _fix_checks(summary: RunDocument) -> Iterator[Check]:
             raised = summary.filter.process_position_mps != configured_noise(summary.config).position_mps
             close = "; follows them closely, because the position noise was raised" if raised else ""
             more.append(f"filter to {word}: mean {error_text(difference)}, max {error_text(largest)}{close}")
-        for name, one in gnss.classes.items() if len(gnss.classes) > 1 else ():
-            done = {"rejected": one.rejected, "down-weighted": one.down_weighted,
-                    "wrongly reported as fixed": one.sold_as_fixed}  # fmt: skip
+        for name, fixes in gnss.classes.items() if len(gnss.classes) > 1 else ():
+            done = {"rejected": fixes.rejected, "down-weighted": fixes.down_weighted,
+                    "wrongly reported as fixed": fixes.sold_as_fixed}  # fmt: skip
             parts = ", ".join(f"{count:,} {what}" for what, count in done.items() if count)
-            more.append(f"{name} {one.fixes:,}{': ' if parts else ''}{parts}")
+            more.append(f"{name} {fixes.fixes:,}{': ' if parts else ''}{parts}")
         if gnss.recoveries:
             times = "once" if gnss.recoveries == 1 else f"{gnss.recoveries:,} times"
             more.append(f"re-acquired after rejection: {times}")
@@ -328,7 +329,7 @@ def _delay_checks(summary: RunDocument) -> Iterator[Check]:
 
 def corrections(summary: RunDocument) -> list[str]:
     """Return what the alignment corrected, a few words each."""
-    applied = {name: one.applied for name, one in summary.alignment.items()}
+    applied = {name: finding.applied for name, finding in summary.alignment.items()}
     scale, left, right = (applied.get(name) or 1.0 for name in ("wheel_scale", "left_scale", "right_scale"))
     texts = [f"wheels {100 * scale:.1f} %"] if abs(scale - 1.0) > NOTED_SCALE else []
     if abs(left - right) > NOTED_SCALE:
@@ -351,7 +352,7 @@ def to_drive(summary: RunDocument) -> str:
         return ""
     if excitation.verdict.all_shown:
         return lacking_turns(*np.radians([excitation.turned_right_deg, excitation.turned_left_deg]).tolist())
-    return next((one.text for one in excitation.notes if one.code == "turns_lacking"), "")
+    return next((finding.text for finding in excitation.notes if finding.code == "turns_lacking"), "")
 
 
 def streams_section(summary: RunDocument) -> Section:
@@ -373,9 +374,9 @@ def _odometry_table(summary: RunDocument) -> Iterator[Table]:
     names = {"final ICRs": "icr", "momentary ICRs": "icr_momentary", "no slip": "no_slip"}
     errors = {words: getattr(summary.odometry, name) for words, name in names.items()}
     rows = [
-        (words, *(error_text(metres) for metres in (one.mean_error_m, one.max_error_m, one.end_error_m)))
-        for words, one in errors.items()
-        if one is not None and one is not UNSET and one.mean_error_m is not UNSET
+        (words, *(error_text(metres) for metres in (path.mean_error_m, path.max_error_m, path.end_error_m)))
+        for words, path in errors.items()
+        if path is not None and path is not UNSET and path.mean_error_m is not UNSET
     ]
     if rows:
         yield Table("lrrr", rows, ("wheels alone, whole drive", "mean error", "largest", "at the end"))
@@ -403,7 +404,12 @@ def _icr_tables(summary: RunDocument) -> Iterator[Table]:
     head = ("segment", "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
     yield Table("lr", segments, head)
     grounds = [
-        (f"  {number}", f"{one.begin_s:.0f} s", f"{one.end_s:.0f} s", plus_minus(one.multiplier, one.multiplier_std))
-        for number, one in enumerate(summary.wheels.ground_stretches, start=1)
+        (
+            f"  {number}",
+            f"{stretch.begin_s:.0f} s",
+            f"{stretch.end_s:.0f} s",
+            plus_minus(stretch.multiplier, stretch.multiplier_std),
+        )
+        for number, stretch in enumerate(summary.wheels.ground_stretches, start=1)
     ]
     yield Table("lrrr", grounds, ("ground", "begins", "ends", "multiplier ± σ by the turns"))

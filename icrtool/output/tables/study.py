@@ -44,9 +44,9 @@ def study_blocks(result: StudyResult) -> list[Block]:
         blocks += [f"{varies}{errors}; median, and below it [5 %, 95 %] of the runs", ""]
     # The numbers of one setting are listed below its name.
     rows: list[tuple[str, str, str]] = []
-    for head, group in groupby(result.findings, lambda one: one.what.rpartition(": ")[0]):
+    for head, group in groupby(result.findings, lambda number: number.what.rpartition(": ")[0]):
         rows.append((head, "", ""))
-        rows += [(f"  {one.what.rpartition(': ')[2]}", finding_text(one), one.paper) for one in group]
+        rows += [(f"  {number.what.rpartition(': ')[2]}", finding_text(number), number.paper) for number in group]
     return [*blocks, Table("l", rows, ("", "ours", "expected" if request.name == "consistency" else "paper"))]
 
 
