@@ -125,18 +125,18 @@ def fit_into(
 
     Parameters
     ----------
-    directory : of the run; may be at an address, as `icrtool.output.files.remote_place.on_disk` takes it
+    directory : of the run; may be at an address, as `icrtool.output.files.remote_place.folder_on_disk` takes it
     warm_start : run or calibration file to start from
     share : called with the share of the log that was read
     note : as in `icrtool.output.run_directory.new_run`
     """
     from icrtool.logs.read_log import read_log
-    from icrtool.output.files.remote_place import on_disk
+    from icrtool.output.files.remote_place import folder_on_disk
     from icrtool.output.run_directory import check_target, new_run, replaced_log
 
     start, watch = _warm_start(warm_start, config, note), _giving_back(watch)
     path = path_of(directory)
-    with on_disk(path, begin=watch) as on_this_disk:
+    with folder_on_disk(path, begin=watch) as on_this_disk:
         place = directory if on_this_disk is path else on_this_disk
         check_target(place, log, overwrite=files.overwrite)
         watch("reading")

@@ -70,11 +70,11 @@ class KnownDrive:
     def errors(self, trials: Trials, *, turned: bool = False) -> TrialErrors:
         """Return the errors of trials, each with the model that was known at its start; `turned`: with the gyro."""
         errors = TrialErrors.none(trials.ends.shape)
-        for number, some in self._by_learned(trials.starts):
-            column, row = np.nonzero(trials.ends[some].T >= 0)
+        for number, chunk in self._by_learned(trials.starts):
+            column, row = np.nonzero(trials.ends[chunk].T >= 0)
             if not len(row):
                 continue
-            row += some.start
+            row += chunk.start
             start, end = trials.starts[row], trials.ends[row, column]
             near = self._steps_around(start, end)
             path = predicted_path(self.recording, *self._known(number, turned=turned), near)

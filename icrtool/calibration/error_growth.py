@@ -98,7 +98,7 @@ def path_errors(
     # the sources act along the whole path, not only at the ends of the windows
     of_start, of_end = (steps.place_t[rows] + constants.wheels_later_s for rows in (windows.begin, windows.end))
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
-    path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), fitted.parameters, at)
+    path = path_at(steps, lambda rows: (fixed[:, rows], axes, columns[:, rows]), fitted.parameters, at)
     s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)
     moved, by = displacements(path, s, e)
     moved_by, turned_by = by[:-1], path.heading_by[:, e] - path.heading_by[:, s]

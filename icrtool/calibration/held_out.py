@@ -131,26 +131,26 @@ class HeldOut:
         """Errors in the trials of all recordings, one row per model."""
         fold_of = []
         for i, (trials, recording) in enumerate(zip(self.trials, self.recordings, strict=True)):
-            mine = [fold for fold in self.folds if fold.recording == i]
-            edges = [fold.end_m for fold in mine[:-1]]
+            own_folds = [fold for fold in self.folds if fold.recording == i]
+            edges = [fold.end_m for fold in own_folds[:-1]]
             at_m = recording.track.distance[trials.starts]
-            fold_of.append(mine[0].number + np.searchsorted(edges, at_m, side="right"))
+            fold_of.append(own_folds[0].number + np.searchsorted(edges, at_m, side="right"))
         first = np.searchsorted(np.concatenate(fold_of), np.arange(1, len(self.folds)))
         scores = []
         for name in self.rows:
             errors = np.concatenate([self.errors(name, i, trials).position for i, trials in enumerate(self.trials)])
-            by_fold = tuple(error_summary(some) for some in np.split(errors, first))
+            by_fold = tuple(error_summary(fold_errors) for fold_errors in np.split(errors, first))
             scores.append(HeldOutRow(name, by_fold, error_summary(errors)))
         return tuple(scores)
 
     @cached_property
     def error_windows(self) -> tuple[tuple[int, Windows], ...]:
         """Windows of `LENGTHS_M` and `TWIST_OVER_M`, with the number of their recording; a short recording has none."""
-        pooled, found = totals_of(*self.recordings), []
+        pooled, windows = totals_of(*self.recordings), []
         for i, recording in enumerate(self.recordings):
             with suppress(DataError):
-                found.append((i, cut_windows(recording, (TWIST_OVER_M, *LENGTHS_M), pooled)))
-        return tuple(found)
+                windows.append((i, cut_windows(recording, (TWIST_OVER_M, *LENGTHS_M), pooled)))
+        return tuple(windows)
 
     @property
     def has_gyro(self) -> bool:
@@ -232,20 +232,20 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
     """
     if not len(start_m):
         return
-    mine = [fold for fold in folds if fold.recording == recording]
-    if mine[0].whole:
-        yield mine[0], np.arange(len(start_m))
+    own_folds = [fold for fold in folds if fold.recording == recording]
+    if own_folds[0].whole:
+        yield own_folds[0], np.arange(len(start_m))
         return
-    block_m = mine[0].end_m
+    block_m = own_folds[0].end_m
     in_block = int(np.clip(block_m // STRIP_M, 1, MOST_STRIPS))
-    strip_m, last = block_m / in_block, in_block * len(mine) - 1
+    strip_m, last = block_m / in_block, in_block * len(own_folds) - 1
     of_start, of_end = (np.minimum((at / strip_m).astype(np.int64), last) for at in (start_m, end_m))
     pair = of_start * (last + 1) + of_end
     order = np.argsort(pair, kind="stable")
     pairs, first = np.unique(pair[order], return_index=True)
     for pair_number, rows in zip(pairs.tolist(), np.split(order, first[1:]), strict=True):
         a, b = divmod(pair_number, last + 1)
-        block = mine[a // in_block]
+        block = own_folds[a // in_block]
         yield block._replace(begin_m=a * strip_m, end_m=(b + 1) * strip_m), rows
 
 
@@ -265,14 +265,14 @@ def errors_without(
     # The horizons are computed in the order in which the ends lie in memory.
     column, row = np.nonzero(trials.ends.T >= 0)
     start, end = trials.starts[row], trials.ends[row, column]
-    for fold, some in left_out(folds, i, distance[start], distance[end]):
+    for fold, in_fold in left_out(folds, i, distance[start], distance[end]):
         if (prediction := without(fold)) is not None:
-            s, e = start[some], end[some]
+            s, e = start[in_fold], end[in_fold]
             span = track.t[s.min()], track.t[e.max()]
             near = recording.wheels(track.rows_around(*span)) if steps is None else steps.around(*span)
             missed = trial_errors(recording, s, e, predicted_path(recording, *prediction, near))
             for all_errors, of_fold in zip(errors, missed, strict=True):
-                all_errors[row[some], column[some]] = of_fold
+                all_errors[row[in_fold], column[in_fold]] = of_fold
     return errors
 
 
@@ -326,11 +326,11 @@ def _left_out_windows(
 ) -> Iterator[tuple[int, Windows, Prediction]]:
     """Yield the number of a recording, windows of it with the steps around them, and the model fitted without them."""
     for i, windows in table.error_windows:
-        these = np.flatnonzero(np.isin(windows.length_m, lengths_m))
-        start_m, end_m = (windows.track.distance[rows[these]] for rows in (windows.begin, windows.end))
-        for fold, some in left_out(table.folds, i, start_m, end_m):
+        chosen = np.flatnonzero(np.isin(windows.length_m, lengths_m))
+        start_m, end_m = (windows.track.distance[rows[chosen]] for rows in (windows.begin, windows.end))
+        for fold, in_fold in left_out(table.folds, i, start_m, end_m):
             if (predicted := table.without(name, fold)) is not None:
-                rows = these[some]
+                rows = chosen[in_fold]
                 begin, end = windows.begin[rows], windows.end[rows]
                 steps = windows.track.around(*windows.track.place_t[[begin.min(), end.max()]].tolist())
                 yield i, Windows(steps, begin, end, windows.length_m[rows]), predicted
@@ -352,9 +352,9 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     """
     of_logs: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
     tested = [np.empty((0, 3))]
-    for i, windows, (fitted, own) in _left_out_windows(table, name, LENGTHS_M):
-        errors = error_growth.path_errors(windows, fitted, table.recordings[i].width_m, own)
-        reference = np.exp(-1j * own.heading_offset_rad) * windows.moved
+    for i, windows, (fitted, constants) in _left_out_windows(table, name, LENGTHS_M):
+        errors = error_growth.path_errors(windows, fitted, table.recordings[i].width_m, constants)
+        reference = np.exp(-1j * constants.heading_offset_rad) * windows.moved
         of_logs.append((windows.length_m, errors, errors.turned - windows.turned, errors.moved - reference))
         stretch = np.floor(windows.track.distance[windows.begin] / windows.length_m)
         tested.append(np.column_stack([np.full(len(stretch), i), windows.length_m, stretch]))

@@ -109,22 +109,22 @@ def pooled_constants(
     pairs = []
     for column, usual_std in enumerate(BETWEEN_DRIVES_STD):
         of_offset = column == 0
-        some = np.array([
+        known = np.array([
             (constants.mean[column], constants.std[column])
             for source, constants in of_sources
             if math.isfinite(constants.mean[column]) and not (of_offset and source != heading_source)
         ])  # fmt: skip
-        if of_offset and len(some):
+        if of_offset and len(known):
             # angles about the first one
-            some[:, 0] -= 2.0 * np.pi * np.round((some[:, 0] - some[0, 0]) / (2.0 * np.pi))
-        pairs.append(_further(some, usual_std) if len(some) else (math.nan, math.nan))
+            known[:, 0] -= 2.0 * np.pi * np.round((known[:, 0] - known[0, 0]) / (2.0 * np.pi))
+        pairs.append(_further(known, usual_std) if len(known) else (math.nan, math.nan))
     mean, std = zip(*pairs, strict=True)
     return KnownConstants(LogConstants(*mean), LogConstants(*std))
 
 
-def _further(found: Floats, usual_std: float) -> tuple[float, float]:
+def _further(values_and_stds: Floats, usual_std: float) -> tuple[float, float]:
     """Return mean and standard deviation of a further drive, from the values and deviations of drives (k, 2)."""
-    (values, std), usual = found.T, usual_std**2
+    (values, std), usual = values_and_stds.T, usual_std**2
     variances, between = std**2, usual
     if len(values) >= FEWEST_POOLED:
         measured = between_variance(values, np.maximum(variances, np.finfo(np.float64).tiny))
@@ -176,18 +176,20 @@ def contradictions(row: str, sensors: documents.HeldSensors, among: Iterable[str
         return notes
     for name in among:
         held: documents.MeasuredConstant | None = getattr(sensors.held, name)
-        own: documents.MeasuredConstant | None = getattr(sensors.measured, name)
-        if held is None or own is None:
+        measured: documents.MeasuredConstant | None = getattr(sensors.measured, name)
+        if held is None or measured is None:
             continue
         words, unit, _ = CONSTANT_WORDS[name]
-        apart = math.remainder(own.value - held.value, 360.0) if unit == "°" else own.value - held.value
-        std = math.hypot(held.std, own.std)
+        apart = math.remainder(measured.value - held.value, 360.0) if unit == "°" else measured.value - held.value
+        std = math.hypot(held.std, measured.std)
         if abs(apart) > SENSOR_SIGMAS * std:
             both = (
                 f"holds {constant_text(sensors.held, name)} and this log shows {constant_text(sensors.measured, name)}"
             )
             why = f"{words}: the calibration {both}, {abs(apart) / std:.1f} σ apart"
-            what = "the errors of its rows include this difference; --refit-sensors takes the constants of this log"
+            consequence = (
+                "the errors of its rows include this difference; --refit-sensors takes the constants of this log"
+            )
             advice = "calibrate again if a sensor was moved or a clock has changed"
-            notes.append(note(SENSORS_CONTRADICT, f"row {row}: {why}: {what}; {advice}"))
+            notes.append(note(SENSORS_CONTRADICT, f"row {row}: {why}: {consequence}; {advice}"))
     return notes

@@ -142,10 +142,10 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
         (("yaw",), used.process_heading_degps, "deg/s", configured.heading_degps, "process_heading_degps",
          settings.process_heading_degps is None),
     ):  # fmt: skip
-        how = f"of preset {used.preset}, not contradicted by the innovations" if free else "configured"
+        origin = f"of preset {used.preset}, not contradicted by the innovations" if free else "configured"
         if std > first:
-            how = f"raised from {first:g} by the filter's innovations"
-        source = f"({std:g} {unit})² × {REFERENCE_STEP_S:g} s, filter.{key}: {how}"
+            origin = f"raised from {first:g} by the filter's innovations"
+        source = f"({std:g} {unit})² × {REFERENCE_STEP_S:g} s, filter.{key}: {origin}"
         value = REFERENCE_STEP_S * (math.radians(std) if unit == "deg/s" else std) ** 2
         estimates |= {name: Estimate(value, None, source) for name in names}
     return estimates
@@ -167,19 +167,19 @@ def _speed_noise(calibration: Calibration, run: Run) -> dict[str, Estimate]:
     moving = np.abs(table.v_left_mps) + np.abs(table.v_right_mps) > 0.0
     gaps = np.concatenate([[0], np.cumsum(run.in_gap)])
     good = moving[k:] & moving[:-k] & (gaps[k:-1] == gaps[: -k - 1]) & (lasted > 0.0)
-    blocks, which = np.unique((table.t_s[:-k][good] // BLOCK_S).astype(np.int64), return_inverse=True)
+    blocks, block = np.unique((table.t_s[:-k][good] // BLOCK_S).astype(np.int64), return_inverse=True)
     if len(blocks) < 2:
         return {}
     v_x, _, yaw_rate = calibration.twist(table.v_left_mps, table.v_right_mps)
     return {
-        name: _mean_of_blocks((speed[k:] - speed[:-k])[good] ** 2 / lasted[good], which, float(np.median(lasted)))
+        name: _mean_of_blocks((speed[k:] - speed[:-k])[good] ** 2 / lasted[good], block, float(np.median(lasted)))
         for name, speed in (("vx", v_x), ("vyaw", yaw_rate))
     }
 
 
-def _mean_of_blocks(squares: Floats, which: Ints, lasted_s: float) -> Estimate:
-    count = np.bincount(which)
-    means = np.bincount(which, weights=squares) / count
+def _mean_of_blocks(squares: Floats, block: Ints, lasted_s: float) -> Estimate:
+    count = np.bincount(block)
+    means = np.bincount(block, weights=squares) / count
     std = float(means.std() / math.sqrt(len(means)))
     return Estimate(float(squares.mean()), std, f"changes of the wheels' speed within {lasted_s:.3g} s, while moving")
 
@@ -227,8 +227,8 @@ def _antenna(run: Run) -> tuple[AntennaPlace | None, str]:
     if forward is not None and right is not None:
         frames = run.config.frames
         configured = frames.antenna_forward_m != "auto" or frames.antenna_right_m != "auto"
-        how = "frames.antenna_forward_m, antenna_right_m" if configured else "the log's own transforms (/tf_static)"
-        return AntennaPlace(forward, -right, how), ""
+        origin = "frames.antenna_forward_m, antenna_right_m" if configured else "the log's own transforms (/tf_static)"
+        return AntennaPlace(forward, -right, origin), ""
     words = []
     for key, label in (
         (ANTENNA_AHEAD, "antenna forward - x ICR"),

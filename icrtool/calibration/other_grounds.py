@@ -45,10 +45,12 @@ def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -
     if len(names) < FEWEST_GROUNDS:
         return ()
     for ground in names:
-        others = [recording for recording, of in zip(recordings, grounds, strict=True) if of != ground]
-        mine = [recording for recording, of in zip(recordings, grounds, strict=True) if of == ground]
+        others = [recording for recording, own_ground in zip(recordings, grounds, strict=True) if own_ground != ground]
+        on_ground = [
+            recording for recording, own_ground in zip(recordings, grounds, strict=True) if own_ground == ground
+        ]
         with suppress(DataError):
-            scores += _scores(ground, mine, fit_models(others, (FIVE, RECOMMENDED)))
+            scores += _scores(ground, on_ground, fit_models(others, (FIVE, RECOMMENDED)))
     return tuple(scores)
 
 

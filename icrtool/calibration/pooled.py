@@ -227,8 +227,8 @@ def calibration_from(
     with_gyro = table.fits[f"{RECOMMENDED}{held_out.GYRO_SUFFIX}"].fitted if has_gyro else None
     logs = []
     for i, recording in enumerate(recordings):
-        own, metres = best.constants(i), float(recording.track.distance[-1])
-        offset_deg, delay_s = math.degrees(own.heading_offset_rad), -own.wheels_later_s
+        constants, metres = best.constants(i), float(recording.track.distance[-1])
+        offset_deg, delay_s = math.degrees(constants.heading_offset_rad), -constants.wheels_later_s
         sensors = sensors_of(recording, best.pool.windows[i], best.fitted, with_gyro)
         numbers = metres, offset_deg, delay_s, recording.begin_ns
         logs.append(
@@ -365,7 +365,7 @@ def calibrate_runs(
     `grounds` names the ground of each run, or none.
     """
     ground_of = iter(grounds)
-    taken: list[_Taken] = []
+    taken: list[_CalibratedRun] = []
     left_out: list[LeftOut] = []
     alone: tuple[Note, ...] = ()
     for run in runs:
@@ -374,7 +374,7 @@ def calibrate_runs(
         recording = turning_recording_of(run)
         robot = robot_of(run, recording.width_m)
         positions = run.sensors.fixes.north_m + 1j * run.sensors.fixes.east_m
-        candidate = _Taken(recording, positions, robot, use_notes(run, alone=False), ground)
+        candidate = _CalibratedRun(recording, positions, robot, use_notes(run, alone=False), ground)
         if why := _why_left_out(run, candidate, taken, allow_unusable=allow_unusable):
             left_out.append(LeftOut(run.name, why))
             continue
@@ -397,7 +397,7 @@ def calibrate_runs(
     return calibrate_recordings(recordings, robots[0], notes, named)._replace(left_out=tuple(left_out))
 
 
-class _Taken(NamedTuple):
+class _CalibratedRun(NamedTuple):
     """A run that is calibrated.
 
     Attributes
@@ -414,7 +414,7 @@ class _Taken(NamedTuple):
     ground: str
 
 
-def _is_part(log: _Taken, longer_log: _Taken) -> bool:
+def _is_part(log: _CalibratedRun, longer_log: _CalibratedRun) -> bool:
     """Return whether a log is only a part of a longer log, for example because its recording was cut off.
 
     The part has the stamps of the longer log. At equal stamps both have equal wheel speeds and positions. Wheel speeds
@@ -434,7 +434,7 @@ def _is_part(log: _Taken, longer_log: _Taken) -> bool:
     return bool(same.sum() >= SAME_SHARE * len(stamps) and shared >= SAME_SHARE * len(log.positions))
 
 
-def _why_left_out(run: Run, candidate: _Taken, taken: Sequence[_Taken], *, allow_unusable: bool) -> str:
+def _why_left_out(run: Run, candidate: _CalibratedRun, taken: Sequence[_CalibratedRun], *, allow_unusable: bool) -> str:
     """Return why a run is left out of the calibration; empty where it is taken."""
     if not (run.usable or allow_unusable):
         return f"not usable: {run.document.unusable_because}"

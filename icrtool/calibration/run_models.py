@@ -217,9 +217,9 @@ def compare_models(
     recording, heading, notes = _with_heading(run, headings)
     parts = {"ahead of": recording.lever.ahead, "to the right of": recording.lever.aside}
     if unknown := " and ".join(word for word, known in parts.items() if not known):
-        what = f"how far {unknown} the body's origin the position is measured is not known"
+        unknown_place = f"how far {unknown} the body's origin the position is measured is not known"
         lever = "in row controller it is a constant of this log"
-        why = f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it"
+        why = f"{unknown_place}: {lever}; frames.antenna_forward_m and antenna_right_m set it"
         notes.append(note("lever_unknown", why))
     held_out = hold_out([recording])
     driven = recording if past is None else with_poses_of(recording, past)
@@ -260,18 +260,18 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
     return plain, "", notes
 
 
-def _rows(run: Run, found: HeldOut, kind: str, past: Recording) -> Iterator[ComparedRow]:
+def _rows(run: Run, held_out: HeldOut, kind: str, past: Recording) -> Iterator[ComparedRow]:
     """Yield the held-out rows; the rows of the filter's ICRs with a measured heading come last.
 
     `past` is the recording with the poses that were known when it was driven.
     """
-    for name in found.rows:
+    for name in held_out.rows:
         if name == NO_SLIP:
             continue
         public = name.replace(GYRO_SUFFIX, f"_{kind}")
-        yield ComparedRow(public, partial(found.errors, name, 0), partial(found.path, name, 0))
-    if found.has_gyro:
-        (recording,) = found.recordings
+        yield ComparedRow(public, partial(held_out.errors, name, 0), partial(held_out.path, name, 0))
+    if held_out.has_gyro:
+        (recording,) = held_out.recordings
         for model in models_of(run):
             # Rows for comparison have the middle of the ICRs at the origin: with a measured turn each is no_slip_gyro.
             if not row_of(model.name).compared:
@@ -314,10 +314,12 @@ def turned_path(run: Run, recording: Recording, turned: Floats, rows: slice) -> 
     lo, hi = rows.start, rows.stop - 1
     place = np.zeros(hi + 1 - lo, np.complex128)
     for begin in range(lo, hi, ROWS_AT_ONCE):
-        some = slice(begin, min(begin + ROWS_AT_ONCE, hi))
-        of = slice(some.start - lo, some.stop - lo)
-        moved = recording.track.held[some] * (run.table.v_left_mps[some] + run.table.v_right_mps[some]) / 2.0
-        place[of.start + 1 : of.stop + 1] = moved * np.exp(0.5j * (turned[of] + turned[of.start + 1 : of.stop + 1]))
+        chunk = slice(begin, min(begin + ROWS_AT_ONCE, hi))
+        filled = slice(chunk.start - lo, chunk.stop - lo)
+        moved = recording.track.held[chunk] * (run.table.v_left_mps[chunk] + run.table.v_right_mps[chunk]) / 2.0
+        place[filled.start + 1 : filled.stop + 1] = moved * np.exp(
+            0.5j * (turned[filled] + turned[filled.start + 1 : filled.stop + 1])
+        )
     return turned, np.cumsum(place, out=place)
 
 
@@ -341,20 +343,20 @@ def _errors_turned(
     errors = TrialErrors.none(trials.ends.shape)
     of_line = np.searchsorted(trials.starts, np.append(first_rows, len(track.t)))
     for line, (scale, bias) in enumerate(zip(scales.tolist(), biases.tolist(), strict=True)):
-        mine = slice(of_line[line], of_line[line + 1])
-        if mine.start == mine.stop or (last := int(trials.ends[mine].max())) < 0:
+        line_trials = slice(of_line[line], of_line[line + 1])
+        if line_trials.start == line_trials.stop or (last := int(trials.ends[line_trials].max())) < 0:
             continue
-        first = int(trials.starts[mine.start])
+        first = int(trials.starts[line_trials.start])
         rows = slice(first, last + 1)
         psi, place = turned_path(run, recording, scale * turned[rows] + bias * lasted[rows], rows)
         for h in range(trials.ends.shape[1]):
-            some = mine.start + np.flatnonzero(trials.ends[mine, h] >= 0)
-            s, e = trials.starts[some], trials.ends[some, h]
+            tried = line_trials.start + np.flatnonzero(trials.ends[line_trials, h] >= 0)
+            s, e = trials.starts[tried], trials.ends[tried, h]
             right, left, x = (column if len(column) == 1 else column[s] for column in icrs)
             arm = (right + left) / 2.0 - 1j * x
             begin, end = psi[s - first], psi[e - first]
             moved = place[e - first] - place[s - first] - 1j * arm * (np.exp(1j * end) - np.exp(1j * begin))
             driven = track.north[e] - track.north[s] + 1j * (track.east[e] - track.east[s])
-            errors.position[some, h] = np.abs(np.exp(1j * (track.heading[s] - begin)) * moved - driven)
-            errors.heading[some, h] = np.abs(end - begin - track.heading[e] + track.heading[s])
+            errors.position[tried, h] = np.abs(np.exp(1j * (track.heading[s] - begin)) * moved - driven)
+            errors.heading[tried, h] = np.abs(end - begin - track.heading[e] + track.heading[s])
     return errors

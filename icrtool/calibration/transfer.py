@@ -82,11 +82,11 @@ def compare_calibrations(
     """Return the comparison of groups of recordings by their calibrations; see `compare_groups`."""
     tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
     cells, costs = [], []
-    for (row, result), (column, own) in product(results.items(), results.items()):
+    for (row, result), (column, column_result) in product(results.items(), results.items()):
         held_out = applied = tested[column, column]
         if row != column:
             # Another track width or wheel radius: another robot.
-            ours, theirs = result.calibration, own.calibration
+            ours, theirs = result.calibration, column_result.calibration
             same_width = math.isclose(ours.width_m, theirs.width_m, rel_tol=1e-3)
             applied = held_out._replace(errors=np.full_like(held_out.errors, np.nan))
             if same_width and ours.robot.wheel_radius_m == theirs.robot.wheel_radius_m:

@@ -90,27 +90,27 @@ def batch_command(
       icrtool batch season/ -o results --robot husky-a200 --calibration last-season.json
       icrtool batch logs.csv -o results -j 4 --gate "recommended.p95@10m <= 1.5"
     """  # noqa: D301 - click reads the escape
-    asked = batch.report
-    compared = options.baseline_of(batch.baseline, asked.gates)
-    options.calibrations_of(batch.calibrations, asked)
-    with remote_place.on_disk(output, parts=fleet_files.FOLDERS) as folder:
+    report_request = batch.report
+    compared = options.baseline_of(batch.baseline, report_request.gates)
+    options.calibrations_of(batch.calibrations, report_request)
+    with remote_place.folder_on_disk(output, parts=fleet_files.FOLDERS) as folder:
         requests = batches.plan_requests(places, output, batch, folder)
         folder.mkdir(parents=True, exist_ok=True)
         view = View(len(requests), printer)
         rows = run_all(requests, workers, batch, view, folder)
     missing = compared.missing(row.log for row in rows) if compared is not None else []
     # Of an address once more: it has the runs now.
-    with remote_place.on_disk(output, parts=fleet_files.FOLDERS) as folder:
+    with remote_place.folder_on_disk(output, parts=fleet_files.FOLDERS) as folder:
         calibrations = []
-        if asked.ladder:
-            pooled = fleet_files.pooled_calibrations(rows, folder, output, allow_unusable=asked.allow_unusable)
+        if report_request.ladder:
+            pooled = fleet_files.pooled_calibrations(rows, folder, output, allow_unusable=report_request.allow_unusable)
             calibrations = list(pooled)
         new = any((row.status, row.this_time) == ("done", "processed") for row in rows)
         plots = batch.files.plots if new or not (folder / fleet_files.PLOTS).is_dir() else ()
         document = fleet_files.write_fleet(rows, folder, calibrations, plots, page=batch.files.page)
         results = ("fleet.csv", "failures.csv", "calibrations", "plots", "report.html", "runs")
-        there = [name for name in results if (folder / name).exists()]
-        written = ", ".join(f"{name}/" if (folder / name).is_dir() else name for name in there)
+        existing = [name for name in results if (folder / name).exists()]
+        written = ", ".join(f"{name}/" if (folder / name).is_dir() else name for name in existing)
     if compared is not None:
         printer.warn(map(escaped, fleet_files.changes_of(rows, missing)))
     exports.write(

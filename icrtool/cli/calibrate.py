@@ -79,7 +79,7 @@ def calibrate_command(
     runs = runs_named(places, config, printer)
     sensors = None
     if len(runs) == 1:
-        printer.warn_of(runs[0])
+        printer.warn_about(runs[0])
         sensors = sensor_findings.calibrate_log(runs[0], x_icr_m=x_icr)
     result = None
     try:

@@ -123,7 +123,7 @@ def dropout_report_command(
     )
     verdicts = [verdict for result in reports.values() for verdict in result.document.gates]
     options.check_compared(verdicts)
-    inputs.leave("runs and logs", gate_failed=not all(verdict.passed for verdict in verdicts))
+    inputs.exit_if_failed("runs and logs", gate_failed=not all(verdict.passed for verdict in verdicts))
 
 
 def plan_sources(
@@ -170,7 +170,7 @@ def report_one(
     """Return the report on one source; `place` is the run directory of a log, None for a run."""
     with ExitStack() as stack:
         if place is None:
-            folder = stack.enter_context(remote_place.on_disk(source, needed=bool))
+            folder = stack.enter_context(remote_place.folder_on_disk(source, needed=bool))
             run = run_directory.open_run(folder, whole=False)
         else:
             # Run and report are one result: if the report fails, an older run in this place stays, with its report.

@@ -78,12 +78,12 @@ def export_command(source: Path | None, target: str | None, output: Path | None,
       icrtool export --for evo icrtool-runs/field -o trajectories
       icrtool export --for foxglove icrtool-runs/field -o field.mcap
     """  # noqa: D301 - click reads the escape
-    target = _checked(target, source, output)
+    target = _checked_target(target, source, output)
     if target in TRAJECTORIES and output is not None:
         # An existing place decides between file and folder; for a new place the suffix decides.
         suffixes = (*paths.SUFFIXES.values(), *TEXT_SUFFIXES)
         if not (output.is_file() or (output.suffix.lower() in suffixes and not output.is_dir())):
-            _write_trajectories(_run(source), cast(TrajectoryFormat, target), output)
+            _write_trajectories(_run_to_export(source), cast(TrajectoryFormat, target), output)
             return
     if output is not None:
         atomic.check_place(output)
@@ -97,7 +97,7 @@ def export_command(source: Path | None, target: str | None, output: Path | None,
         else:
             text = controllers.format_export(calibration, cast(ControllerTarget, target))
     else:
-        run = _run(source, output)
+        run = _run_to_export(source, output)
         if target == "foxglove" and output is not None:
             _write_foxglove(run, output)
             return
@@ -108,16 +108,16 @@ def export_command(source: Path | None, target: str | None, output: Path | None,
     write_or_print(text if target in TRAJECTORIES else f"{text}\n", output)
 
 
-def _checked(target: str | None, source: Path | None, output: Path | None) -> str:
+def _checked_target(target: str | None, source: Path | None, output: Path | None) -> str:
     """Return the target; refuse a command without a target, and a binary target without an output file."""
     if target is None:
-        raise click.UsageError(_what_to_type(source))
+        raise click.UsageError(_example_commands(source))
     if target == "foxglove" and output is None:
         raise click.UsageError("an MCAP file is not text: name it with -o FILE.mcap")
     return target
 
 
-def _what_to_type(source: Path | None) -> str:
+def _example_commands(source: Path | None) -> str:
     """Return an example command for each kind of program; without programs that need paths for a calibration."""
     name = "RUN" if source is None else shlex.quote(escaped(str(source)))
     of_run = source is None or source.is_dir()
@@ -151,7 +151,7 @@ def _write_foxglove(run: Run, output: Path) -> None:
     click.echo(f"written to {output}; layout for Foxglove: {layout.path}")
 
 
-def _run(source: Path | None, output: Path | None = None) -> Run:
+def _run_to_export(source: Path | None, output: Path | None = None) -> Run:
     """Return the run whose paths are exported, even if it is not usable; refuse its log as the output."""
     if source is not None and is_log(source):
         advice = f"icrtool fit {escaped(str(source))} makes its run"

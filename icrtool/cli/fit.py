@@ -92,9 +92,9 @@ def fit_command(
                 ["icrtool", "info", escaped(str(log)), "-v", *options.options_to_repeat(settings, request)]
             )
             printer.show([*run_tables.run_blocks(run.document), *run_tables.next_blocks(run.document, where, examine)])
-            printer.warn_of(run, most=MOST_WARNINGS)
+            printer.warn_about(run, most=MOST_WARNINGS)
     printer.json("fit", {"logs": inputs.documents})
-    inputs.leave("logs", gate_failed=strict and not all_usable)
+    inputs.exit_if_failed("logs", gate_failed=strict and not all_usable)
 
 
 @contextmanager
@@ -126,7 +126,7 @@ def fitted_log(
     ):
         yield run_and_directory
     if warns:
-        printer.warn_of(run_and_directory[0])
+        printer.warn_about(run_and_directory[0])
     printer.warn(reported)
     for line in text_format.jump_lines(run_and_directory[0].document.reference_jumps):
         printer.detail(line)
@@ -152,7 +152,7 @@ def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSo
         with inputs.each(log) as document:
             _examine(log, config, request, options_given, document, printer)
     printer.json("info", {"logs": inputs.documents})
-    inputs.leave("logs")
+    inputs.exit_if_failed("logs")
 
 
 def _examine(

@@ -73,7 +73,7 @@ POSITIVE = _Positive(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
 
 
-USUAL = (
+USUAL_OPTIONS = (
     "output", "robot", "config", "set", "topics", "path", "duration", "speed", "seed", "runs", "jobs", "budget",
     "calibration", "gate", "baseline", "outage", "plots", "overwrite", "strict", "json", "quiet", "verbose", "help",
 )  # fmt: skip
@@ -87,11 +87,11 @@ class GroupedCommand(click.Command):
         """Write the options of the help."""
         declared = [parameter for parameter in self.get_params(ctx) if isinstance(parameter, click.Option)]
         shown = [
-            (shown_option, found)
+            (shown_option, help_record)
             for shown_option in declared
-            if (found := shown_option.get_help_record(ctx)) is not None
+            if (help_record := shown_option.get_help_record(ctx)) is not None
         ]
-        places = {f"--{name}": place for place, name in enumerate(USUAL)}
+        places = {f"--{name}": place for place, name in enumerate(USUAL_OPTIONS)}
 
         def place(parameter: click.Parameter) -> int | None:
             return next((places[name] for name in parameter.opts if name in places), None)
@@ -100,7 +100,7 @@ class GroupedCommand(click.Command):
         rest = [pair for pair in shown if place(pair[0]) is None]
         for title, pairs in (("Options", usual), ("More options", rest)):
             with formatter.section(title):
-                formatter.write_dl([found for _, found in pairs])
+                formatter.write_dl([help_record for _, help_record in pairs])
 
 
 def command(name: str, **further: Any) -> Callable[[Command], click.Command]:
@@ -172,7 +172,7 @@ def add_options(command: Command, *options: Option) -> Command:
     return command
 
 
-def add_all(*options: Option) -> Option:
+def option_group(*options: Option) -> Option:
     """Return a decorator that adds several options."""
     return lambda command: add_options(command, *options)
 
@@ -296,7 +296,7 @@ def _limit(variable: str, read: str) -> Callable[[click.Context, click.Parameter
     return set_limit
 
 
-INPUT_LIMITS = add_all(
+INPUT_LIMITS = option_group(
     option("--most-bytes", "N", None, "Most that is saved of standard input or of a file at an address, for example "
            "800000, 500M or 2GB; default: half of the free space of the temporary folder.",
            expose_value=False, callback=_limit("MOST_BYTES", "bytes_in")),
@@ -329,7 +329,7 @@ PLACES = options_as_record(
 """-o and --into as `place`, and --overwrite."""
 
 
-CUT = add_all(
+CUT = option_group(
     option("--from start", "TIME", None, "Read the log from here: seconds since the log's first message, or a time in "
            "ISO 8601 (UTC without a zone)."),
     option("--to end", "TIME", None, "Read the log up to here."),
@@ -352,14 +352,14 @@ SEED = option("--seed", None, click.IntRange(min=0), "Seed of all noise; the sam
 
 def plot_formats(text: str) -> tuple[str, ...]:
     """Return the formats in the value of ``--plots``: ``png,svg,pdf`` or ``none``."""
-    asked = tuple(part.strip().lower() for part in text.split(",") if part.strip())
-    if asked == ("none",):
+    chosen = tuple(part.strip().lower() for part in text.split(",") if part.strip())
+    if chosen == ("none",):
         return ()
     formats_known = formats.PLOT_FORMATS
-    unknown = [part for part in asked if part not in formats_known]
-    if unknown or not asked:
+    unknown = [part for part in chosen if part not in formats_known]
+    if unknown or not chosen:
         raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of {', '.join(formats_known)}, none")
-    return asked
+    return chosen
 
 
 PLOTS_OPTION = option("--plots", "png,svg,pdf|none", plot_formats, "Formats of the pictures.", default="png")
@@ -370,7 +370,7 @@ BUDGETS = option(
     "--budget budgets_m", "METRES", POSITIVE, "Report how far 95 % of the errors stay within this; repeatable.",
     multiple=True, default=(0.5,),
 )  # fmt: skip
-CALIBRATION_OPTIONS = add_all(
+CALIBRATION_OPTIONS = option_group(
     option("--calibration calibrations", "CAL.json", FILE, "Also predict with a calibration that icrtool calibrate "
            "wrote; repeatable.", multiple=True),
     flag("--refit-sensors", "Refit heading offset, delays and gyro bias of the calibrations in this log, in place of "

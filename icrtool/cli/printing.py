@@ -139,8 +139,8 @@ class Printer(NamedTuple):
         """
         if not self.as_json:
             return
-        own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
-        content = own | {key: value for key, value in plain_data.plain_value(document).items() if key not in own}
+        header = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
+        content = header | {key: value for key, value in plain_data.plain_value(document).items() if key not in header}
         click.echo(formats.json_bytes(content), nl=False)
 
     def detail(self, text: str) -> None:
@@ -154,7 +154,7 @@ class Printer(NamedTuple):
             for warning in warnings:
                 click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
 
-    def warn_of(self, run: Run, *, most: int | None = None) -> None:
+    def warn_about(self, run: Run, *, most: int | None = None) -> None:
         """Print the warnings of a run, with -v also why each stream was chosen.
 
         At most `most` warnings are printed, the gravest first, then the number of the others; -v and --json print all.
@@ -212,11 +212,11 @@ class Inputs:
             named = any(part in str(err) for part in (name, escaped(source.name), escaped(source.stem)))
             print_error(str(err) if named else f"{name}: {err}")
 
-    def leave(self, what: str, *, gate_failed: bool = False) -> None:
+    def exit_if_failed(self, inputs_word: str, *, gate_failed: bool = False) -> None:
         """Exit with status 3 if an acceptance limit was not met, else 1 if an input (a `what`) could not be used."""
         failed = [shortened(escaped(source), LONGEST_NAME) for source in self.errors]
         if failed and len(self.documents) > 1:
-            print_error(f"{len(failed)} of {len(self.documents)} {what} could not be used: {listed(failed, 5)}")
+            print_error(f"{len(failed)} of {len(self.documents)} {inputs_word} could not be used: {listed(failed, 5)}")
         if gate_failed or failed:
             raise SystemExit(3 if gate_failed else 1)
 

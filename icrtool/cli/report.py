@@ -95,12 +95,12 @@ def report_command(
                 _report_on_log(source, places[source], config, report, files, other_results, printer)
                 result = path_of(places[source])
             elif source in again:
-                asked = report.configured(config)
-                dropout_report.report_one(source, None, config, asked, files, other_results, printer)
+                request = report.configured(config)
+                dropout_report.report_one(source, None, config, request, files, other_results, printer)
             reported = source in {*places, *again}
             if not (reported and files.page):
                 _write_page(result, output, coordinates=not no_coordinates, answers=not reported, printer=printer)
-    inputs.leave("sources")
+    inputs.exit_if_failed("sources")
 
 
 def _report_on_log(
@@ -109,8 +109,8 @@ def _report_on_log(
 ) -> None:  # fmt: skip
     """Print the report on a log, and write its run and report; an existing run is not fitted again."""
     request = report.configured(config)
-    there = run_directory.holds_run_of(path_of(place), source, config, request.fit)
-    if there:
+    has_run = run_directory.holds_run_of(path_of(place), source, config, request.fit)
+    if has_run:
         dropout_report.report_one(path_of(place), None, config, request, files, other_results, printer)
     else:
         dropout_report.report_one(source, place, config, request, files, other_results, printer)
@@ -154,8 +154,8 @@ def _page_of(source: Path) -> str:
     if not source.exists():
         advice = "name a log, or what icrtool fit, batch, compare -o or calibrate -o wrote"
         raise errors.RunError(source, "no such file or directory", advice)
-    what = "no run, fleet, comparison or calibration in it"
-    raise errors.RunError(source, what, "icrtool fit, batch, compare and calibrate -o make one")
+    why = "no run, fleet, comparison or calibration in it"
+    raise errors.RunError(source, why, "icrtool fit, batch, compare and calibrate -o make one")
 
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> tuple[str, list[Block]]:

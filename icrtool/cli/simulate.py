@@ -273,10 +273,10 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
     right, left, x = plan.icrs_m
     if plan.robot is not None:
         right, left, x = (float(truth[name].mean()) for name in runs.ICR_COLUMNS)
-    what = f"{plan.path.kind} path" if isinstance(plan.path, drives.PathPlan) else "track speeds as given"
+    driven_text = f"{plan.path.kind} path" if isinstance(plan.path, drives.PathPlan) else "track speeds as given"
     lines = [
         f"robot  {config.robot.name or 'as configured'}, b = {needed_number(config, 'track_width_m'):g} m",
-        f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {seed}",
+        f"drive  {driven_text}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {seed}",
         f"ICRs   y right {right:+z.3f}, y left {left:+z.3f}, x {x:+z.3f} m{', mean' if plan.robot else ''}",
     ]
     lines += [f"       from {time:g} s on {', '.join(f'{icr:+z.3f}' for icr in icrs)} m" for time, icrs in plan.changes]
@@ -337,8 +337,8 @@ def study_command(
     """  # noqa: D301 - click reads the escape
     config, arguments = settings.load(), click.get_current_context().params
     check_varied(studies.STUDIES[name], name, arguments)
-    asked, robot = request(studies.default_request(name, config)), config.robot
-    driven, drive, sensed = path(asked.path), asked.plan, sensors(asked.sensors)
+    study_request, robot = request(studies.default_request(name, config)), config.robot
+    driven, drive, sensed = path(study_request.path), study_request.plan, sensors(study_request.sensors)
     if robot.track_width_m is not None:
         drive = replace(drive, icrs_m=default_icrs(config))
     drive = plan(replace(drive, path=driven))
@@ -350,21 +350,21 @@ def study_command(
     if robot.wheel_radius_m is not None:
         counts = encoder_counts or robot.encoder_counts_per_rev or PAPER_COUNTS
         sensed = replace(sensed, metres_per_count=2 * math.pi * robot.wheel_radius_m / counts)
-    paths = (driven.kind,) if arguments["kind"] is not None and asked.paths else asked.paths
+    paths = (driven.kind,) if arguments["kind"] is not None and study_request.paths else study_request.paths
     if preset is None and "filter.preset" in config.given:
         preset = config.filter.preset
     if preset is None and name == "convergence" and robot.track_width_m is not None:
         preset = "field"
-    presets = asked.presets if preset is None else (preset,)
-    asked = replace(asked, plan=drive, sensors=sensed, paths=paths, presets=presets)
+    presets = study_request.presets if preset is None else (preset,)
+    study_request = replace(study_request, plan=drive, sensors=sensed, paths=paths, presets=presets)
     directory = output if output is not None else RUNS_FOLDER / f"study-{name}"
     simulation_files.check_study_target(directory)
     with printer.progress(f"study {name}") as progress:
-        result = studies.run_study(asked, progress)
+        result = studies.run_study(study_request, progress)
     simulation_files.write_study(result, directory, plots=plots)
     printer.show(study_tables.study_blocks(result))
     printer.text(f"\nwritten to {directory}")
-    printer.detail(f"settings: {asked.settings()}")
+    printer.detail(f"settings: {study_request.settings()}")
 
 
 def check_varied(study: Study, name: str, arguments: Mapping[str, object]) -> None:

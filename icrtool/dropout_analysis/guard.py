@@ -44,8 +44,8 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
         return None
     trials = np.array([[row.trials for row in rows[name]] for name in names])
     enough = np.flatnonzero(trials.min(axis=0) >= FEWEST_TRIALS)
-    of = enough if len(enough) else np.arange(len(errors.horizons_m))
-    h = int(of[np.abs(errors.horizons_m[of] - CHOICE_HORIZON_M).argmin()])
+    compared = enough if len(enough) else np.arange(len(errors.horizons_m))
+    h = int(compared[np.abs(errors.horizons_m[compared] - CHOICE_HORIZON_M).argmin()])
     horizon, least = f"{errors.horizons_m[h]:g} m", int(trials[:, h].argmin())
     seconds = int(errors.counts.trials[h]) * summary.drive.duration_s / max(errors.states, 1)
     expected = min(int(errors.counts.trials[h]), seconds / LONGEST_RECORDING_STEP_S, MOST_TRIALS)

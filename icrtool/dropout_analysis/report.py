@@ -229,8 +229,8 @@ class BaselineReport:
         if gate.budget_m is None:
             row, sums = self.at(gate.model, gate.horizon_m or math.nan)
             if row is None:
-                what = f"no {gate.model} over {gate.horizon_m:g} m in the baseline {self.path}"
-                raise ConfigError(f"gate {gate.text!r}", what, "make the baseline again")
+                why = f"no {gate.model} over {gate.horizon_m:g} m in the baseline {self.path}"
+                raise ConfigError(f"gate {gate.text!r}", why, "make the baseline again")
             return float(documents.column_of([row], METRICS[gate.metric])[0]), sums
         rows = [row for result in self.document.models if result.name == gate.model for row in result.by_horizon]
         if not rows:
@@ -288,8 +288,8 @@ class BaselineReport:
         of_drives, freedom = pooled_variance(measured, count - 1.0, row_of(model).spread.between ** 2)
         before = factor * math.exp(float(logarithms.mean()))
         between = student_factor(freedom) * math.sqrt(of_drives * (1.0 + 1.0 / count)) * before
-        own = student_factor(len(now.trials) - 1.0) * math.sqrt(variance_of_sum(now.influence(metric)))
-        return math.hypot(between, own)
+        path_half = student_factor(len(now.trials) - 1.0) * math.sqrt(variance_of_sum(now.influence(metric)))
+        return math.hypot(between, path_half)
 
 
 def pooled_baseline(drives: Sequence[documents.DropoutDocument], log: str, path: str) -> BaselineReport:
@@ -389,13 +389,13 @@ def best_row(
     difference, and the intervals of both expected errors overlap. The difference alone is not enough: where all turns
     of a drive lie in one block, its interval is wider than any error.
     """
-    own = {used.name for used in calibrations if used.fitted_to_this}
+    not_compared = {used.name for used in calibrations if used.fitted_to_this}
     # A localisation in the log uses further sensors.
-    own |= {result.name for result in errors.results if kind_of(result.name) == TOPIC_ROW}
+    not_compared |= {result.name for result in errors.results if kind_of(result.name) == TOPIC_ROW}
     rows = {
         result.name: row_of(result.name)
         for result in errors.results
-        if not turned_by(result.name) and result.name not in own
+        if not turned_by(result.name) and result.name not in not_compared
     }
     results = {result.name: result for result in errors.results if result.name in rows and rows[result.name].on_robot}
     means = {name: result.column("expected_error_m") for name, result in results.items()}

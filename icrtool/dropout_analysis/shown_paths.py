@@ -85,9 +85,9 @@ def errors_by_start(
     rows = compared.rows if compared is not None else ()
     held_out = next((row for row in rows if row.name == RECOMMENDED), None)
     if compared is not None and held_out is not None:
-        some = compared.table.trials[0].starts
+        sparse = compared.table.trials[0].starts
         errors = np.full(len(ends), np.nan)
-        errors[some] = held_out.errors_of(Trials(some, ends[some])).position[:, 0]
+        errors[sparse] = held_out.errors_of(Trials(sparse, ends[sparse])).position[:, 0]
     else:
         errors = open_loop_errors(track, icrs.icrs, ends)[:, 0]
     return StartErrors(icrs.name if held_out is None else held_out.name, horizon_m, errors, ends[:, 0])
@@ -203,15 +203,15 @@ def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple
     begins = sorted(float(t) for t in at_s) if at_s else _spaced(run, length_s)
     for begin in begins:
         if not 0 <= begin <= last - length_s:
-            what = f"{length_s:g} s from {begin:g} s on do not fit"
-            raise ConfigError("outage", what, f"the drive lasts {last:.1f} s")
+            why = f"{length_s:g} s from {begin:g} s on do not fit"
+            raise ConfigError("outage", why, f"the drive lasts {last:.1f} s")
     for begin, following in pairwise(begins):
         if begin + length_s >= following:
-            what = f"{length_s:g} s from {begin:g} s on reach into the one at {following:g} s"
-            raise ConfigError("outage", what, "the filter must learn between two outages: place them further apart")
+            why = f"{length_s:g} s from {begin:g} s on reach into the one at {following:g} s"
+            raise ConfigError("outage", why, "the filter must learn between two outages: place them further apart")
     for begin in np.array(begins)[_meets(np.array(begins), length_s, _own_outages_s(run))]:
-        what = f"{length_s:g} s from {begin:g} s on lie in an outage of the log's own"
-        raise ConfigError("outage", what, "there is no estimate to compare it with: choose another time")
+        why = f"{length_s:g} s from {begin:g} s on lie in an outage of the log's own"
+        raise ConfigError("outage", why, "there is no estimate to compare it with: choose another time")
     origin = int(run.table.stamp_ns[0])
     return tuple((origin + round(t * 1e9), origin + round((t + length_s) * 1e9)) for t in begins)
 
@@ -240,9 +240,9 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
     for begin, end in spans_ns:
         inside = slice(*np.searchsorted(stamps, [begin, end]))
         if len(stamps[inside]) < 2:
-            what = f"{(end - begin) / 1e9:g} s from {(begin - origin) / 1e9:g} s on hold fewer than two states"
+            why = f"{(end - begin) / 1e9:g} s from {(begin - origin) / 1e9:g} s on hold fewer than two states"
             advice = "the filter must have begun, and the outage last longer than a wheel sample"
-            raise ConfigError("outage", what, advice)
+            raise ConfigError("outage", why, advice)
         document = OutageDocument(
             "forced", (begin - origin) / 1e9, (end - origin) / 1e9, float(np.ptp(distance[inside])),
             finite_or_none(float(away[inside][-1])), finite_or_none(float(away[inside].max())),
@@ -308,9 +308,9 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         # distance from the antenna on the path to each used fix after the outage
         rows = np.flatnonzero(run.gnss.used & (fixes.stamp_ns >= end) & (fixes.stamp_ns <= max(end, stamps[-1])))
         cos, sin = np.cos(path.heading), np.sin(path.heading)
-        at, of = (fixes.stamp_ns[rows] - stamps[0]) / 1e9, (stamps - stamps[0]) / 1e9
-        north = np.interp(at, of, path.north + forward * cos - right * sin) - fixes.north_m[rows]
-        east = np.interp(at, of, path.east + forward * sin + right * cos) - fixes.east_m[rows]
+        at, state_s = (fixes.stamp_ns[rows] - stamps[0]) / 1e9, (stamps - stamps[0]) / 1e9
+        north = np.interp(at, state_s, path.north + forward * cos - right * sin) - fixes.north_m[rows]
+        east = np.interp(at, state_s, path.east + forward * sin + right * cos) - fixes.east_m[rows]
         error = finite_or_none(float(np.hypot(north.mean(), east.mean())))
         inside = slice(last - first + 1)
         driven_m = float(table.distance_m[last] - table.distance_m[first])

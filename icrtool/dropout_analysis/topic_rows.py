@@ -116,14 +116,14 @@ def _errors(poses: TopicPoses, t: Floats, track: Track, trials: Trials) -> Trial
     """
     errors = TrialErrors.none(trials.ends.shape)
     for h in range(trials.ends.shape[1]):
-        some = np.flatnonzero(trials.ends[:, h] >= 0)
-        some = some[poses.covered(t, track.t[trials.starts[some]], track.t[trials.ends[some, h]])]
-        s, e = trials.starts[some], trials.ends[some, h]
+        tried = np.flatnonzero(trials.ends[:, h] >= 0)
+        tried = tried[poses.covered(t, track.t[trials.starts[tried]], track.t[trials.ends[tried, h]])]
+        s, e = trials.starts[tried], trials.ends[tried, h]
         (from_place, from_heading), (to_place, to_heading) = (poses.at(t, track.t[rows]) for rows in (s, e))
         moved = np.exp(1j * (track.heading[s] - from_heading)) * (to_place - from_place)
         driven = track.north[e] - track.north[s] + 1j * (track.east[e] - track.east[s])
-        errors.position[some, h] = np.abs(moved - driven)
-        errors.heading[some, h] = np.abs(to_heading - from_heading - track.heading[e] + track.heading[s])
+        errors.position[tried, h] = np.abs(moved - driven)
+        errors.heading[tried, h] = np.abs(to_heading - from_heading - track.heading[e] + track.heading[s])
     return errors
 
 

@@ -110,7 +110,7 @@ def measure_errors(
         each = pool.map if at_once > TRIAL_THREADS else map
         for columns in [slice(begin, begin + at_once) for begin in range(0, len(horizons), at_once)]:
             group, ends = horizons[columns], counted_ends(track, horizons[columns], starts).T
-            trials = _Started.of(run, track, group, ends)
+            trials = _StartedTrials.of(run, track, group, ends)
             for number, (model, of_few, rows) in enumerate(
                 zip(predictors, sparse_errors, by_model, strict=True), start=1
             ):
@@ -169,7 +169,7 @@ def _by_learning(
     return documents.LearnedDocument("icr", at_s, driven_m, before, after)
 
 
-class _Started(NamedTuple):
+class _StartedTrials(NamedTuple):
     """The trials at some horizons (h,), by the states (n,) at which they start.
 
     Attributes
@@ -184,21 +184,21 @@ class _Started(NamedTuple):
     slipping: list[Bools | None]
 
     @classmethod
-    def of(cls, run: Run, track: Track, horizons_m: Floats, ends: Rows) -> _Started:
+    def of(cls, run: Run, track: Track, horizons_m: Floats, ends: Rows) -> _StartedTrials:
         """Return the trials that start at all states; `ends` (h, n) are the states at which they end."""
         blocks = _blocks(track.distance, horizons_m, (column >= 0 for column in ends))
         return cls(track.distance, blocks, _slipping_trials(run, ends))
 
-    def at(self, starts: Ints, horizons_m: Floats, errors: Floats) -> _Started:
+    def at(self, starts: Ints, horizons_m: Floats, errors: Floats) -> _StartedTrials:
         """Return the trials at some starts (k,), which have errors (k, h)."""
         path_m = self.path_m[starts]
         slipping = [None if touches is None else touches[starts] for touches in self.slipping]
-        return _Started(path_m, _blocks(path_m, horizons_m, np.isfinite(errors.T)), slipping)
+        return _StartedTrials(path_m, _blocks(path_m, horizons_m, np.isfinite(errors.T)), slipping)
 
 
 def _statistics(
     model: Model | ComparedRow, horizons_m: Floats, errors: Floats, of_few: TrialErrors, columns: slice,
-    trials: _Started, each: Callable[..., Iterable[_AtHorizon]],
+    trials: _StartedTrials, each: Callable[..., Iterable[_AtHorizon]],
 ) -> Iterable[_AtHorizon]:  # fmt: skip
     """Return the statistics of a model's errors (n, h) at some horizons.
 

@@ -92,12 +92,12 @@ def icr_std_m(run: Run, column: IcrColumn) -> Floats:
     filter knows no more at the end than at the start (a warm start), the difference of the variances, or their ratio,
     is applied instead.
     """
-    own: Floats = np.asarray(getattr(run.table, f"std_{column}"), np.float64)
+    filter_std: Floats = np.asarray(getattr(run.table, f"std_{column}"), np.float64)
     final = run.document.icr.final_std[column]
-    if final is None or not own[-1] > 0.0:
-        return own
+    if final is None or not filter_std[-1] > 0.0:
+        return filter_std
     clock = min(run.document.icr.x_clock_std_m, final) if column == "x_icr_m" else 0.0
-    variance, first, end = own**2, float(own[0]) ** 2, final**2 - clock**2
+    variance, first, end = filter_std**2, float(filter_std[0]) ** 2, final**2 - clock**2
     if 0.0 < end < first and variance[-1] < first:
         gained = 1.0 / variance - 1.0 / first
         factor = (1.0 / end - 1.0 / first) / gained[-1]

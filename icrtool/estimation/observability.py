@@ -239,8 +239,8 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
     information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
     std: Floats = np.sqrt(np.diag(np.linalg.solve(information, np.eye(6)))[:3])
     turns, spins = _turns(track, width)
-    turned_right, spun_to_right = (float(some.clip(min=0.0).sum()) for some in (turns, turns[spins]))
-    turned_left, spun_to_left = (0.0 - float(some.clip(max=0.0).sum()) for some in (turns, turns[spins]))
+    turned_right, spun_to_right = (float(angles.clip(min=0.0).sum()) for angles in (turns, turns[spins]))
+    turned_left, spun_to_left = (0.0 - float(angles.clip(max=0.0).sum()) for angles in (turns, turns[spins]))
     stds: dict[str, float] = dict(zip(ICR_COLUMNS, std.tolist(), strict=True))
     verdicts: dict[str, Excited] = {
         name: "shown" if value / width <= SHOWN_SHARE else "weak" if value / width <= WEAK_SHARE else "not shown"
@@ -261,12 +261,12 @@ def _turns(track: Track, width_m: float) -> tuple[Floats, Bools]:
     """Return the turn of a robot with each wheel sample (n,) [rad], and which of these turns are spins."""
     turns, spins = np.empty(len(track.t)), np.empty(len(track.t), np.bool_)
     for lo in range(0, len(track.t), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE)
-        left, right = track.v_left[some], track.v_right[some]
+        chunk = slice(lo, lo + ROWS_AT_ONCE)
+        left, right = track.v_left[chunk], track.v_right[chunk]
         # noise of encoders at rest is no turn
         moving = np.abs(left) + np.abs(right) > 0.02
-        turns[some] = np.where(moving, track.held[some] * (left - right) / width_m, 0.0)
-        spins[some] = np.abs(left - right) > SPIN_RATIO * np.abs(left + right) / 2
+        turns[chunk] = np.where(moving, track.held[chunk] * (left - right) / width_m, 0.0)
+        spins[chunk] = np.abs(left - right) > SPIN_RATIO * np.abs(left + right) / 2
     return turns, spins
 
 

@@ -226,9 +226,9 @@ def _integrate(t: Floats, rate: Floats, at: Floats) -> Floats:
     """Return the turn [rad] up to each state at times `at`: trapezoids, first and last rate held beyond the samples."""
     whole, turned = np.empty(len(at)), trapezoids(t, rate)
     for lo in range(0, len(at), ROWS_AT_ONCE):
-        some = at[lo : lo + ROWS_AT_ONCE]
-        within = np.interp(some, t, turned)
-        within += np.minimum(some - t[0], 0.0) * rate[0]
-        within += np.maximum(some - t[-1], 0.0) * rate[-1]
-        whole[lo : lo + len(some)] = within
+        chunk = at[lo : lo + ROWS_AT_ONCE]
+        within = np.interp(chunk, t, turned)
+        within += np.minimum(chunk - t[0], 0.0) * rate[0]
+        within += np.maximum(chunk - t[-1], 0.0) * rate[-1]
+        whole[lo : lo + len(chunk)] = within
     return whole

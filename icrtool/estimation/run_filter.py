@@ -341,14 +341,14 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
     seen_s = (stamps - table.stamp_ns[0]) / 1e9
     off = wrapped(headings.heading_rad[rows] - np.interp(seen_s, table.t_s, psi))
     for lo in range(0, len(psi), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE)
-        last = np.searchsorted(stamps, table.stamp_ns[some], side="right") - 1
-        age = table.t_s[some] - seen_s[last]
+        chunk = slice(lo, lo + ROWS_AT_ONCE)
+        last = np.searchsorted(stamps, table.stamp_ns[chunk], side="right") - 1
+        age = table.t_s[chunk] - seen_s[last]
         recent = (last >= 0) & (age < LONGEST_CARRY_S)
         std = np.sqrt(headings.var_rad2[rows[last]] + TURN_WANDER_RAD**2 * np.abs(age))
-        clear = recent & (CLEARLY * std < table.std_heading_rad[some])
-        np.add(psi[some], off[last], out=psi[some], where=clear)
-        np.copyto(table.std_heading_rad[some], std, where=clear)
+        clear = recent & (CLEARLY * std < table.std_heading_rad[chunk])
+        np.add(psi[chunk], off[last], out=psi[chunk], where=clear)
+        np.copyto(table.std_heading_rad[chunk], std, where=clear)
 
 
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:

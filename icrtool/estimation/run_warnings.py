@@ -271,11 +271,11 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[Note]:
         advice = "frames.antenna_forward_m sets how far ahead of the body origin it is, and is added to x"
         why = f"x {x:+z.2f} m is counted from the position sensor (antenna), {unknown}: {advice}"
         return [note("antenna_forward_unknown", why, name)]
-    side, other = ("right", "left") if middle > 0 else ("left", "right")
+    side, opposite = ("right", "left") if middle > 0 else ("left", "right")
     where = f"{abs(middle):.2f} m"
     why = (
-        f"both ICRs lie {where} to the {side} of the position sensor (antenna): the sensor is {other} of "
-        f"the centre line, or the sides slip unequally. If it is {where} {other} of it, set "
+        f"both ICRs lie {where} to the {side} of the position sensor (antenna): the sensor is {opposite} of "
+        f"the centre line, or the sides slip unequally. If it is {where} {opposite} of it, set "
         f"frames.antenna_right_m={-middle:z.2f}, and frames.antenna_forward_m, from which x_icr is counted"
     )
     return [note("antenna_aside_unknown", why, name)]

@@ -249,12 +249,12 @@ def assess_icrs(
     """
     table, width = filtered.table, config.robot.track_width_m
     track = track_of_states(table, filtered.in_gap, filtered.outages_ns)
-    windows, own = cut_states(table, track, width), filtered.covariance[3:, 3:]
+    windows, filter_covariance = cut_states(table, track, width), filtered.covariance[3:, 3:]
     if config.filter.rules.final_of_filter:
-        return own, find_excitation(windows, {}), 0.0
+        return filter_covariance, find_excitation(windows, {}), 0.0
     covariance = final_covariance(
         windows,
-        own,
+        filter_covariance,
         process_icr_mps=config.filter.process_icr_mps,
         track_width_m=width,
         since_s=max((t for t in filtered.changes_s if t < table.t_s[-1]), default=0.0),

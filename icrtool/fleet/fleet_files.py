@@ -83,7 +83,7 @@ def check_tables(folder: Path, *, page: bool) -> None:
 
 def pictures_of_batch(folder: Path) -> list[Path]:
     """Return the paths of the pictures of a batch, below its folder, in every format."""
-    names = [name for name, entry in FIGURES.items() if entry.of == "fleet"]
+    names = [name for name, entry in FIGURES.items() if entry.subject == "fleet"]
     return [folder / PLOTS / f"{name}.{form}" for name in names for form in formats.PLOT_FORMATS]
 
 

@@ -430,8 +430,8 @@ def processor() -> tuple[str, str]:
     Numba's settings for both apply; ``NUMBA_ENABLE_AVX`` applies only to code that numba itself runs.
     """
     name = os.environ.get("NUMBA_CPU_NAME") or llvm.get_host_cpu_name()
-    own = "" if name == "generic" else llvm.get_host_cpu_features().flatten()
-    return name, os.environ.get("NUMBA_CPU_FEATURES", own)
+    features = "" if name == "generic" else llvm.get_host_cpu_features().flatten()
+    return name, os.environ.get("NUMBA_CPU_FEATURES", features)
 
 
 @functools.cache

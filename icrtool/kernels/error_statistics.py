@@ -351,9 +351,9 @@ def count_cells(errors_m: Floats, width_m: float) -> tuple[NDArray[np.int16], In
     cell = np.empty(len(errors_m), np.int16)
     counts = np.zeros(int(errors_m.max() / width_m) + 1 if len(errors_m) else 0, np.int64)
     for lo in range(0, len(errors_m), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE)
-        cell[some] = errors_m[some] / width_m
-        counts += np.bincount(cell[some], minlength=len(counts))
+        chunk = slice(lo, lo + ROWS_AT_ONCE)
+        cell[chunk] = errors_m[chunk] / width_m
+        counts += np.bincount(cell[chunk], minlength=len(counts))
     return cell, counts
 
 

@@ -136,10 +136,10 @@ def drive(t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, which: Ints,
     -------
     (n, 3) N, E [m], psi [rad] (unwrapped)
     """
-    held, own, dt = slice(len(t) - 1), icrs[which[:-1]], np.diff(t)
-    turned = dt * body_velocity(v_left[held], v_right[held], *own.T)[2]
+    held, held_icrs, dt = slice(len(t) - 1), icrs[which[:-1]], np.diff(t)
+    turned = dt * body_velocity(v_left[held], v_right[held], *held_icrs.T)[2]
     heading = np.cumsum(np.append(start[2], turned))
-    moved = _arcs(heading[:-1], v_left[held], v_right[held], own, dt)
+    moved = _arcs(heading[:-1], v_left[held], v_right[held], held_icrs, dt)
     return np.cumsum(np.vstack([start, moved]), axis=0)
 
 

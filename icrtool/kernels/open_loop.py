@@ -136,8 +136,8 @@ def open_loop_path(
     """
     path = OpenLoopPath(*np.empty((3, end - start + 1)))
     path.north[0], path.east[0], path.heading[0] = track.north[start], track.east[start], track.heading[start]
-    for reached, some in open_loop_pieces(track, FrozenIcrs.constant(y_icr_right, y_icr_left, x_icr), start, end):
-        for column, values in zip(path, some, strict=True):
+    for reached, piece in open_loop_pieces(track, FrozenIcrs.constant(y_icr_right, y_icr_left, x_icr), start, end):
+        for column, values in zip(path, piece, strict=True):
             column[reached.start - start : reached.stop - start] = values
     return path
 
@@ -150,10 +150,10 @@ def open_loop_pieces(track: Track, icrs: FrozenIcrs, start: int, end: int) -> It
     turned, place = 0.0, 0j
     ahead = cmath.exp(1j * track.heading[start])
     for lo in range(start, end, ROWS_AT_ONCE):  # a path of a whole drive is as long as a column of the run
-        some = slice(lo, min(lo + ROWS_AT_ONCE, end))
-        y_icr_right, y_icr_left, x_icr = (column if len(column) == 1 else column[some] for column in icrs)
-        over = track.held[some] / np.maximum(np.abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M)
-        left, right = track.v_left[some] * over, track.v_right[some] * over
+        chunk = slice(lo, min(lo + ROWS_AT_ONCE, end))
+        y_icr_right, y_icr_left, x_icr = (column if len(column) == 1 else column[chunk] for column in icrs)
+        over = track.held[chunk] / np.maximum(np.abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M)
+        left, right = track.v_left[chunk] * over, track.v_right[chunk] * over
         turn = left - right
         heading = turned + np.cumsum(np.append(0.0, turn))
         moved = (left * y_icr_right - right * y_icr_left - 1j * x_icr * turn) * np.exp(1j * heading[:-1])
@@ -161,7 +161,7 @@ def open_loop_pieces(track: Track, icrs: FrozenIcrs, start: int, end: int) -> It
         turned, place = heading[-1], places[-1]
         places *= ahead
         yield (
-            slice(some.start + 1, some.stop + 1),
+            slice(chunk.start + 1, chunk.stop + 1),
             OpenLoopPath(
                 track.north[start] + places.real, track.east[start] + places.imag, track.heading[start] + heading[1:]
             ),
@@ -224,8 +224,8 @@ def wheel_steps(columns: Columns, first: int, last: int, turn: float) -> Iterato
     """Yield the steps from state `first`, where D is `turn` [m], to state `last`, some at a time."""
     held, v_left, v_right, *_ = columns
     for lo in range(first, last, MAX_BLOCK):
-        some = slice(lo, min(lo + MAX_BLOCK, last))
-        left, right = held[some] * v_left[some], held[some] * v_right[some]
+        chunk = slice(lo, min(lo + MAX_BLOCK, last))
+        left, right = held[chunk] * v_left[chunk], held[chunk] * v_right[chunk]
         turns = turn + np.cumsum(np.append(0.0, left - right))
         yield WheelSteps(lo, left, right, turns)
         turn = turns[-1]
@@ -364,8 +364,8 @@ def solve_block(
         # All starts are among the first states.
         if steps.first == starts.start:
             turn = steps.turn[: starts.stop - starts.start]
-            own = FrozenIcrs(*(column[: len(turn)] for column in icrs))
-            frozen = freeze_starts(plan, own, heading[starts][: len(turn)], turn)
+            block_icrs = FrozenIcrs(*(column[: len(turn)] for column in icrs))
+            frozen = freeze_starts(plan, block_icrs, heading[starts][: len(turn)], turn)
         else:
             rows[0] = rows[-1]
         sums = rows[: len(steps.turn)]
@@ -400,13 +400,13 @@ def fill_open_loop_errors(
         row_hi = min(row_lo + min(max(CONSTANT_BLOCK if constant else BLOCK, first_window), size), starts)
         while True:
             block, last = slice(lo + row_lo, lo + row_hi), int(ends[:, row_lo:row_hi].max(initial=-1))
-            own = icrs if constant else FrozenIcrs(*(column[block] for column in icrs))
-            plan = plan_block(columns, own, last, block)
+            block_icrs = icrs if constant else FrozenIcrs(*(column[block] for column in icrs))
+            plan = plan_block(columns, block_icrs, last, block)
             if plan.moments or row_hi - row_lo <= MIN_BLOCK:
                 break
             row_hi = row_lo + (row_hi - row_lo) // 2
         if plan.moments:
-            solve_block(columns, own, plan, ends, row_lo, block, last, errors)
+            solve_block(columns, block_icrs, plan, ends, row_lo, block, last, errors)
         else:
             integrate_trials(columns, icrs, ends, lo, row_lo, row_hi, errors)
         row_lo, size = row_hi, min(2 * (row_hi - row_lo), MAX_BLOCK)

@@ -189,16 +189,16 @@ def robust_least_squares(
         if before - after < settled**2:
             break
     scale = scale_by_kind(residuals, kind)
-    found = eliminate(residuals, jacobian, robust_weights(residuals, scale, overlap), parts, pull, x - prior_mean)
-    jacobian = found.reduced(jacobian, parts)
+    solution = eliminate(residuals, jacobian, robust_weights(residuals, scale, overlap), parts, pull, x - prior_mean)
+    jacobian = solution.reduced(jacobian, parts)
     k = jacobian.shape[1]
-    own, away = (of_all[k:].reshape(found.gain.shape[:2]) for of_all in (pull, x - prior_mean))
-    own_prior = np.einsum("pck,pc,pcl->pkl", found.gain, own, found.gain)
-    own_pull = -np.einsum("pck,pc->pk", found.gain, own * away)
+    own, away = (of_all[k:].reshape(solution.gain.shape[:2]) for of_all in (pull, x - prior_mean))
+    own_prior = np.einsum("pck,pc,pcl->pkl", solution.gain, own, solution.gain)
+    own_pull = -np.einsum("pck,pc->pk", solution.gain, own * away)
     prior = np.diag(pull[:k]) + own_prior.sum(axis=0)
     return RobustFit(
         residuals=residuals, jacobian=jacobian, scale=scale, prior=prior, overlap=overlap, x=x, own_prior=own_prior,
-        own_pull=own_pull, gain=found.gain,
+        own_pull=own_pull, gain=solution.gain,
     )  # fmt: skip
 
 
@@ -218,8 +218,8 @@ def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
     scale = np.empty(len(residuals))
     # There are few kinds, numbered from zero, so that counting is faster than sorting.
     for number in np.flatnonzero(np.bincount(kind)):
-        mine = kind == number
-        scale[mine] = max(mad_std(residuals[mine], 0.0), SMALLEST_SCALE)
+        same_kind = kind == number
+        scale[same_kind] = max(mad_std(residuals[same_kind], 0.0), SMALLEST_SCALE)
     return scale
 
 

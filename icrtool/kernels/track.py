@@ -172,9 +172,9 @@ class Track(NamedTuple):
         gyro = None if self.gyro is None else mean(self.gyro, np.zeros(len(first)))
         return self._replace(t=self.t[first], held=held, v_left=left, v_right=right, gyro=gyro, into=into)
 
-    def gyro_change(self, some: slice = slice(None)) -> Floats:
+    def gyro_change(self, part: slice = slice(None)) -> Floats:
         """Return the change of the gyro's turn rate by time [rad/s^2], of some wheel samples (n,); 0 without a gyro."""
-        rows = np.arange(*some.indices(len(self.t)))
+        rows = np.arange(*part.indices(len(self.t)))
         if self.gyro is None:
             return np.zeros(len(rows))
         before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(self.t) - 1)

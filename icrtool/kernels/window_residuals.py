@@ -74,12 +74,12 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
     turning, direction = np.empty(0, np.int64), np.empty((0, 1))
     heading_by, place_by = np.empty(0), np.zeros(k, np.complex128)
     for lo in range(0, len(track.t), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE)
-        fixed, axis, columns = twists(some)
+        chunk = slice(lo, lo + ROWS_AT_ONCE)
+        fixed, axis, columns = twists(chunk)
         if not lo:
             turning, direction = np.flatnonzero(axis == OMEGA), np.where(axis == VX, 1.0, 1j)[:, None]
             heading_by = np.zeros(len(turning))
-        lasting = track.held[some]
+        lasting = track.held[chunk]
         ahead = track.into * lasting
         v_x, v_y, omega = (
             fixed[component] + parameters[axis == component] @ columns[axis == component]

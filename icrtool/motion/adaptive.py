@@ -152,14 +152,17 @@ class Estimate:
         self, model: MotionModel, width_m: float, mean: Floats, covariance: Floats, constants: KnownConstants
     ) -> None:
         self.model, self.width_m = model, width_m
-        own, k = len(constant_std(model)), len(model.terms)
-        self.mean = np.concatenate([mean, constants.mean[:own]])
-        self.prior = np.diag(np.concatenate([np.zeros(k), np.array(constants.std[:own]) ** -2.0]))
+        constant_count, k = len(constant_std(model)), len(model.terms)
+        self.mean = np.concatenate([mean, constants.mean[:constant_count]])
+        self.prior = np.diag(np.concatenate([np.zeros(k), np.array(constants.std[:constant_count]) ** -2.0]))
         self.prior[:k, :k] = np.linalg.inv(covariance)
         self.pull = self.prior @ self.mean
         self.matrix, self.vector = np.zeros_like(self.prior), np.zeros_like(self.mean)
         self.x, self.scale, self.wander = self.mean, np.array(USUAL_STD), 0.0
-        self.fitted, self.constants = FittedModel(model, mean, covariance), LogConstants(*constants.mean[:own])
+        self.fitted, self.constants = (
+            FittedModel(model, mean, covariance),
+            LogConstants(*constants.mean[:constant_count]),
+        )
 
     def solve_anew(self, windows: Windows, wheels: FittedModel | None = None) -> None:
         """Solve with all windows that have ended, linearised at every step; `wheels` as in `residuals_of`."""
@@ -326,9 +329,9 @@ class AdaptiveModel:
         left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
         estimate = self._wheels if self._turned is None else self._turned
         gyro = np.broadcast_to(np.asarray(gyro_radps, np.float64), left.shape)
-        found = estimate.fitted.twist(wheel_motion(left, right, self.prior.width_m, gyro))
-        found[OMEGA] += estimate.constants.gyro_bias_radps
-        return found[:, 0] if np.ndim(v_left) == 0 else found
+        twist = estimate.fitted.twist(wheel_motion(left, right, self.prior.width_m, gyro))
+        twist[OMEGA] += estimate.constants.gyro_bias_radps
+        return twist[:, 0] if np.ndim(v_left) == 0 else twist
 
     def _take(self, samples: Floats) -> list[Learned]:
         """Take samples, and solve at each knot where a solution is due."""

@@ -118,11 +118,11 @@ class DriveBuffer:
         """Return headings (n,) unwrapped: where known, each differs from the one before by at most a half turn."""
         angles = np.append(self._heading, heading[known])
         turns = np.cumsum(np.rint(np.diff(angles) / (2.0 * np.pi)))
-        found = np.zeros(len(heading))
-        found[known] = angles[1:] - 2.0 * np.pi * turns
+        unwrapped = np.zeros(len(heading))
+        unwrapped[known] = angles[1:] - 2.0 * np.pi * turns
         if len(turns):
-            self._heading = float(found[known][-1])
-        return found
+            self._heading = float(unwrapped[known][-1])
+        return unwrapped
 
     def _close(self, rows: Floats, held: Floats, first: Ints) -> None:
         """Keep complete steps as means over their time, and the samples of the open step unchanged."""

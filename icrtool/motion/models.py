@@ -234,8 +234,8 @@ def track_geometry(model: MotionModel, parameters: NDArray[Any], width_m: float)
     turn. The radius factors multiply the speeds of the sides, so that one W gives the turn of both:
     a_l = W d omega / d V_l, a_r = -W d omega / d V_r.
     """
-    of = dict(zip(model.terms, parameters.tolist(), strict=True))
-    term = {name: of.get(name, TERMS[name].nominal) for name in _FIVE}
+    by_term = dict(zip(model.terms, parameters.tolist(), strict=True))
+    term = {name: by_term.get(name, TERMS[name].nominal) for name in _FIVE}
     # v = (V_l + V_r) / 2 and w = (V_l - V_r) / b: half the sum and half the difference of the columns
     x_left, x_right = (term["vx_v"] + term["vx_w"]) / 2.0, (term["vx_v"] - term["vx_w"]) / 2.0
     turn_left = (term["omega_v"] / 2.0 + term["omega_w"]) / width_m

@@ -76,7 +76,7 @@ class LogConstants(NamedTuple):
         return self._summed(other, -1.0)
 
     def _summed(self, other: LogConstants, sign: float) -> LogConstants:
-        offset, *others = (mine + sign * two for mine, two in zip(self, other, strict=True))
+        offset, *others = (value + sign * two for value, two in zip(self, other, strict=True))
         return LogConstants(math.remainder(offset, 2.0 * math.pi), *others)
 
 
@@ -117,10 +117,10 @@ class Recording:
 
     def wheels(self, rows: Ints | slice = slice(None)) -> Track:
         """Return the track with some of its wheel samples, with the speeds that models are fitted to."""
-        some, (left, right) = self.track.wheels(rows), self.wheel_scales
+        track, (left, right) = self.track.wheels(rows), self.wheel_scales
         if (left, right) == (1.0, 1.0):
-            return some
-        return some._replace(v_left=some.v_left / left, v_right=some.v_right / right)
+            return track
+        return track._replace(v_left=track.v_left / left, v_right=track.v_right / right)
 
 
 class Totals(NamedTuple):
@@ -180,9 +180,9 @@ def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
         return 1
     total_s = float(held.sum())
     for lo in range(0, len(held), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE)
-        wheels = recording.wheels(some)
-        travel[some] = wheels.held * (np.abs(wheels.v_left) + np.abs(wheels.v_right))
+        chunk = slice(lo, lo + ROWS_AT_ONCE)
+        wheels = recording.wheels(chunk)
+        travel[chunk] = wheels.held * (np.abs(wheels.v_left) + np.abs(wheels.v_right))
     speed_mps = float(travel.sum()) / 2.0 / total_s
     step_s = min(
         (total_s if pooled_s is None else pooled_s) / MOST_RECORDING_STEPS,
@@ -201,8 +201,8 @@ def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:
     rows, into = max(ROWS_AT_ONCE // samples, 1) * samples, (samples - 1) / (2.0 * samples)
     parts = []
     for lo in range(0, len(recording.track.t), rows):
-        some = recording.wheels(slice(lo, lo + rows))
-        parts.append(some.joined(np.arange(0, len(some.t), samples), into))
+        chunk = recording.wheels(slice(lo, lo + rows))
+        parts.append(chunk.joined(np.arange(0, len(chunk.t), samples), into))
     t, held, left, right = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "held", "v_left", "v_right")
     )
@@ -315,13 +315,13 @@ def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> 
 
 
 def predicted_path(
-    recording: Recording, fitted: FittedModel, own: LogConstants = NO_CONSTANTS, steps: Track | None = None
+    recording: Recording, fitted: FittedModel, constants: LogConstants = NO_CONSTANTS, steps: Track | None = None
 ) -> PathAt:
     """Return the path that a model makes of a recording's wheels and gyro, at times of its poses.
 
     Parameters
     ----------
-    own : constants of the recording
+    constants : constants of the recording
     steps : the wheel samples joined; default single samples, Euler steps as in `icrtool.kernels.open_loop`
 
     Notes
@@ -329,21 +329,21 @@ def predicted_path(
     The path stands still in a gap of the wheel data. The offset of the reference's heading is subtracted from the
     path's heading.
     """
-    of = steps if steps is not None else recording.track
+    driven = steps if steps is not None else recording.track
 
-    def twists(some: slice) -> tuple[Floats, Ints, Floats]:
-        wheels = recording.wheels(some) if steps is None else steps.wheels(some)
+    def twists(rows: slice) -> tuple[Floats, Ints, Floats]:
+        wheels = recording.wheels(rows) if steps is None else steps.wheels(rows)
         gyro = wheels.gyro
-        if gyro is not None and own.gyro_later_s:
-            gyro = gyro + own.gyro_later_s * of.gyro_change(some)
+        if gyro is not None and constants.gyro_later_s:
+            gyro = gyro + constants.gyro_later_s * driven.gyro_change(rows)
         motion = wheel_motion(wheels.v_left, wheels.v_right, recording.width_m, gyro)
         moving = fitted.twist(motion)
-        moving[OMEGA] += own.gyro_bias_radps
+        moving[OMEGA] += constants.gyro_bias_radps
         return moving, np.empty(0, np.int64), np.empty((0, len(motion.v)))
 
     def at_times(at: Floats) -> tuple[Floats, Complexes]:
-        path = path_at(of, twists, np.empty(0), at + own.wheels_later_s)
-        return path.heading - own.heading_offset_rad, path.place
+        path = path_at(driven, twists, np.empty(0), at + constants.wheels_later_s)
+        return path.heading - constants.heading_offset_rad, path.place
 
     return at_times
 

@@ -135,7 +135,7 @@ def residuals_of(
     def evaluate(parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
         offset, delay = constants[:CONSTANTS_OF_WHEELS].tolist()
         fixed, axes, columns, values = columns_at(parameters, constants)
-        path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, knot_t + delay)
+        path = path_at(steps, lambda rows: (fixed[:, rows], axes, columns[:, rows]), values, knot_t + delay)
         turned, turned_by = turn_residuals(path, start, end, seen_turned, root)
         strayed = heading_wander(turned * root, windows.length_m) if wander is None else wander
         share = shortening_by_wander(strayed, windows.length_m)
@@ -249,9 +249,9 @@ class PooledFit(FittedModel):
 
     def with_clock_error(self, x_std_m: float) -> PooledFit:
         """Return the fit with a further standard deviation of its x_icr [m], -vy_w b / (2 omega_w)."""
-        of = dict(zip(self.model.terms, self.parameters.tolist(), strict=True))
+        by_term = dict(zip(self.model.terms, self.parameters.tolist(), strict=True))
         place, covariance = self.model.terms.index("vy_w"), self.covariance.copy()
-        covariance[place, place] += (2.0 * of["omega_w"] / self.pool.widths_m[0] * x_std_m) ** 2
+        covariance[place, place] += (2.0 * by_term["omega_w"] / self.pool.widths_m[0] * x_std_m) ** 2
         return replace(self, covariance=covariance)
 
     def constants(self, recording: int) -> LogConstants:
@@ -259,9 +259,9 @@ class PooledFit(FittedModel):
         return LogConstants(*self._own(self.solution.x, recording).tolist())
 
     def _own(self, x: Floats, recording: int) -> Floats:
-        own = len(constant_std(self.model))
-        first = len(self.parameters) + own * recording
-        return x[first : first + own]
+        constant_count = len(constant_std(self.model))
+        first = len(self.parameters) + constant_count * recording
+        return x[first : first + constant_count]
 
     def without(self, fold: Fold) -> Prediction | None:
         """Return the model fitted without a fold, and the constants of the fold's recording for this model.
@@ -299,8 +299,8 @@ class PooledFit(FittedModel):
             # without the fold is minus the fold's gradient
             steps = np.linalg.solve(self.curvature - curvature, gradient)
             fitted = FittedModel(model, self.parameters + steps, covariance, wheels)
-            own = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
-            return fitted, LogConstants(*own.tolist())
+            constants = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
+            return fitted, LogConstants(*constants.tolist())
         x, covariance = self._reweighted(clear, model)
         return FittedModel(model, x[:k], covariance, wheels), LogConstants(*self._own(x, i).tolist())
 
@@ -479,9 +479,9 @@ class Pool:
 
     def prior(self, model: MotionModel) -> tuple[Floats, Floats]:
         """Return mean and standard deviation of all parameters, model first, then the constants of each recording."""
-        own = np.tile(constant_std(model), len(self.windows))
-        mean = np.concatenate([model.prior_mean, np.zeros(len(own))])
-        return mean, np.concatenate([model.prior_std, own])
+        constants_std = np.tile(constant_std(model), len(self.windows))
+        mean = np.concatenate([model.prior_mean, np.zeros(len(constants_std))])
+        return mean, np.concatenate([model.prior_std, constants_std])
 
     def without(self, recording: int) -> Pool:
         """Return the windows of the other recordings."""
@@ -515,17 +515,17 @@ class Pool:
         of_recordings = [
             residuals_of(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)
         ]
-        k, own, count = len(model.terms), len(constant_std(model)), len(self.windows)
+        k, constant_count, count = len(model.terms), len(constant_std(model)), len(self.windows)
         mean, std = self.prior(model)
 
         def evaluate(x: Floats) -> tuple[Floats, Floats]:
-            residuals, jacobian = np.empty(len(self.group)), np.empty((len(self.group), k + own))
-            for i, constants in enumerate(x[k:].reshape(count, own)):
+            residuals, jacobian = np.empty(len(self.group)), np.empty((len(self.group), k + constant_count))
+            for i, constants in enumerate(x[k:].reshape(count, constant_count)):
                 residuals[self.rows(i)], jacobian[self.rows(i)] = of_recordings[i](x[:k], constants)
             return residuals, jacobian
 
         solution = robust_least_squares(
-            evaluate, mean, mean, std, kind=self.kind, parts=Parts(self.first, own if count > 1 else 0),
+            evaluate, mean, mean, std, kind=self.kind, parts=Parts(self.first, constant_count if count > 1 else 0),
             overlap=self.overlap, settled=LAST_DELAY_STEP_SIGMAS,
         )  # fmt: skip
         levels = [self.group, *([self.recording] if count > 1 else [])]

@@ -21,8 +21,8 @@ from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.output import figure_catalogue
-from icrtool.output.files.atomic import Kind, atomic_directory
-from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, logs_of_fleet, read_document, schema_of
+from icrtool.output.files.atomic import DirectoryKind, atomic_directory
+from icrtool.output.files.formats import csv_bytes, json_bytes, logs_of_fleet, read_document, relist_files, schema_of
 from icrtool.output.run_directory import REPORT_FILES, is_run_directory
 from icrtool.records.choices import FigureSet
 from icrtool.records.dropout_document import DropoutDocument, SummaryRow
@@ -83,9 +83,9 @@ def write_report(
         write_tables(report, partial)
         names = [path.relative_to(partial).as_posix() for path in sorted(partial.rglob("*")) if path.is_file()]
         if in_run := is_run_directory(of_run):
-            list_anew(of_run, name)
+            relist_files(of_run, name)
     if in_run:
-        list_anew(of_run, name, names)
+        relist_files(of_run, name, names)
     return report
 
 
@@ -94,7 +94,7 @@ def is_dropout_directory(directory: Path) -> bool:
     return schema_of(Below(directory, REPORT_FILE)).startswith(DROPOUT_FAMILY)
 
 
-REPORT = Kind(
+REPORT = DirectoryKind(
     "dropout report",
     # In a run, a report with a damaged report.json may be replaced.
     lambda place: is_dropout_directory(place) or is_run_directory(place.parent),
@@ -268,8 +268,8 @@ class Baseline:
                 return
             robots.append(robot)
         theirs = ", ".join(sorted({escaped(robot) for robot, _ in self.kinds.values() if robot})) or "none with a name"
-        asked = ", ".join(sorted({escaped(robot) for robot in robots if robot})) or "no robot named (--robot)"
-        why = f"neither these logs nor their robot are in it (robots there: {theirs}; asked: {asked})"
+        given = ", ".join(sorted({escaped(robot) for robot in robots if robot})) or "no robot named (--robot)"
+        why = f"neither these logs nor their robot are in it (robots there: {theirs}; asked: {given})"
         raise ConfigError(f"--baseline {self.path}", why, "logs are matched by content, else by name, else by robot")
 
 

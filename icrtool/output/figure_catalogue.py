@@ -44,7 +44,7 @@ class Entry(NamedTuple):
 
     Attributes
     ----------
-    of : kind of the subject of the figure
+    subject : kind of the subject of the figure
     title, caption : one line each: content of the figure, and what to look for; ``{}`` is the distance in the name
     place : module and name of the function that draws the figure, in ``icrtool.output.figures``
     parts : suffixes of the names of files, each with further arguments of the function; empty: no figure
@@ -52,7 +52,7 @@ class Entry(NamedTuple):
     further : a figure of the paper, drawn only if all figures are requested
     """
 
-    of: Subject
+    subject: Subject
     title: str
     caption: str
     place: str
@@ -182,7 +182,7 @@ def figures_of(
     `watch` is called with the name of each picture before it is drawn.
     """
     for name, entry in FIGURES.items():
-        if entry.of == kind and (figures == "all" or not entry.further):
+        if entry.subject == kind and (figures == "all" or not entry.further):
             for part, arguments in entry.parts(subject).items():
                 watch(f"picture {name}{part}")
                 yield f"{name}{part}", entry.draw(subject, *arguments)

@@ -21,8 +21,8 @@ from icrtool.logs.containers.recording_files import file_sha256, files_of_log, n
 from icrtool.output import figure_catalogue
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import formats, run_columns
-from icrtool.output.files.atomic import Kind, atomic_directory, check_directory, names_in
-from icrtool.output.files.remote_place import lies_there, on_disk
+from icrtool.output.files.atomic import DirectoryKind, atomic_directory, check_directory, names_in
+from icrtool.output.files.remote_place import folder_on_disk, has_file
 from icrtool.output.files.run_columns import MEASUREMENTS_FILE
 from icrtool.records.choices import FigureSet, StatesFormat
 from icrtool.records.places import (
@@ -86,7 +86,7 @@ def check_target(place: Place, log: Path | None = None, *, overwrite: bool = Fal
         raise OutputError(log, "is a run, not a log", f"name its log ({path}), or: icrtool dropout-report {log}")
     check_directory(place, RUN)
     directory = path_of(place)
-    if log is not None and not overwrite and RUN.is_one(directory) and not _is_made_from(directory, log):
+    if log is not None and not overwrite and RUN.recognises(directory) and not _is_made_from(directory, log):
         unknown = "data frames" if is_run_directory(directory) else "its run.json is damaged"
         other = next((file.path for file in _inputs_of(directory)), unknown)
         advice = "name another place, or replace it with --overwrite"
@@ -129,8 +129,12 @@ def holds_run_of(directory: Path, log: Path, config: Config, request: FitRequest
     """Return whether the run in a directory was made from a log with the same settings by this version."""
     if isinstance(directory, UrlPath) or not is_run_directory(directory) or not _is_made_from(directory, log):
         return False
-    asked = _asked_of(directory)
-    return asked is not None and asked.tool_version == __version__ and not changed_settings(directory, config, request)
+    settings = _stored_settings(directory)
+    return (
+        settings is not None
+        and settings.tool_version == __version__
+        and not changed_settings(directory, config, request)
+    )
 
 
 def changed_settings(directory: Path, config: Config, request: FitRequest) -> list[str]:
@@ -138,11 +142,11 @@ def changed_settings(directory: Path, config: Config, request: FitRequest) -> li
 
     Section ``dropout`` does not change a fit, so it is not compared. A run that cannot be read has no settings.
     """
-    asked = _asked_of(directory)
-    if asked is None:
+    settings = _stored_settings(directory)
+    if settings is None:
         return []
     now: dict[str, Any] = config.effective() | {"request": msgspec.to_builtins(request)}
-    before: dict[str, Any] = {**asked.config, "request": asked.request}
+    before: dict[str, Any] = {**settings.config, "request": settings.request}
     options = {"request.start": "--from", "request.end": "--to", "request.changes_s": "--terrain-change"}
     left_out = {"request.smooth"}
     changes = []
@@ -157,26 +161,26 @@ def changed_settings(directory: Path, config: Config, request: FitRequest) -> li
     return changes
 
 
-def _same(stored: object, asked: object) -> bool:
-    return json.dumps(plain_value(stored), sort_keys=True) == json.dumps(plain_value(asked), sort_keys=True)
+def _same(stored: object, requested: object) -> bool:
+    return json.dumps(plain_value(stored), sort_keys=True) == json.dumps(plain_value(requested), sort_keys=True)
 
 
 def _stated(value: object) -> str:
     return "not given" if value is None or value == [] else shortened(escaped(str(value)), LONGEST_NAME)
 
 
-class _Asked(Record, frozen=True):
+class _StoredSettings(Record, frozen=True):
     config: dict[str, Any]
     request: dict[str, Any] = msgspec.field(default_factory=dict)
     tool_version: str = ""
 
 
-def _asked_of(directory: Path) -> _Asked | None:
+def _stored_settings(directory: Path) -> _StoredSettings | None:
     """Return the settings of a run without a check of its checksums; None if the run cannot be read."""
     if isinstance(directory, UrlPath) or not is_run_directory(directory):
         return None
     try:
-        return formats.read_document(Below(directory, RUN_FILE), _Asked, escape=False)
+        return formats.read_document(Below(directory, RUN_FILE), _StoredSettings, escape=False)
     except (OSError, ValueError, RecursionError):
         return None
 
@@ -276,11 +280,11 @@ def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
 def is_run_directory(directory: Path) -> bool:
     """Return whether a directory or an address is a run that icrtool wrote."""
     if isinstance(directory, UrlPath):
-        return lies_there(directory, RUN_FILE)
+        return has_file(directory, RUN_FILE)
     return formats.schema_of(Below(directory, RUN_FILE)).startswith(RUN_FAMILY)
 
 
-RUN = Kind(
+RUN = DirectoryKind(
     "run directory",
     # A run with a damaged run.json may be replaced.
     lambda place: is_run_directory(place) or is_regular(Below(place, formats.SOURCES_FILE)),
@@ -321,7 +325,7 @@ def open_run(path: str | Path, *, whole: bool = True) -> Run:
         The address cannot be read.
     """
     place = place_of(path)
-    with on_disk(place, lambda name: "/" not in name, writes=False) as directory:
+    with folder_on_disk(place, lambda name: "/" not in name, writes=False) as directory:
         return _run_in(directory, place, whole=whole or directory is not place)
 
 
@@ -376,8 +380,8 @@ def log_of(run: Run) -> Path:
         return files[0]
     missing = [file for file in files if not file.is_file()]
     if missing or not files:
-        what = missing[0] if missing else "a list of inputs"
-        why = f"the log it was made from is gone ({what})"
+        gone = missing[0] if missing else "a list of inputs"
+        why = f"the log it was made from is gone ({gone})"
         raise RunError(run.directory or run.name, why, "put it back, or name it")
     folder = files[0].parent
     series = [numbered_file(file) for file in files]

@@ -95,8 +95,8 @@ def places(north: Floats, east: Floats, cell_m: float) -> Ints:
         return np.empty(0, np.int64)
     parts = [np.array([0, len(north) - 1])]
     for lo in range(0, len(north), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE + 1)
-        moved = (np.diff(np.floor(north[some] / cell_m)) != 0) | (np.diff(np.floor(east[some] / cell_m)) != 0)
+        chunk = slice(lo, lo + ROWS_AT_ONCE + 1)
+        moved = (np.diff(np.floor(north[chunk] / cell_m)) != 0) | (np.diff(np.floor(east[chunk] / cell_m)) != 0)
         parts.append(lo + 1 + np.flatnonzero(moved))
     return np.unique(np.concatenate(parts))
 

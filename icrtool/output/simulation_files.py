@@ -16,7 +16,7 @@ import numpy as np
 from icrtool import __version__
 from icrtool.errors import DataError, OutputError
 from icrtool.output.files.atomic import (
-    Kind,
+    DirectoryKind,
     atomic_directory,
     check_directory,
     partial_at,
@@ -77,7 +77,7 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
             put_in_place(fresh / truth.name, truth.absolute())
 
 
-BAG = Kind(
+BAG = DirectoryKind(
     "bag directory",
     lambda place: (place / "metadata.yaml").is_file(),
     re.compile(r"metadata\.yaml|[^/]+\.(db3|mcap)(\.zstd)?"),
@@ -166,7 +166,7 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
             save_figure(study_figure(result), partial / name, plots)
 
 
-STUDY = Kind(
+STUDY = DirectoryKind(
     "study directory",
     lambda place: schema_of(Below(place, STUDY_FILE)).startswith(STUDY_FAMILY),
     re.compile(rf"study\.json|({'|'.join(get_args(StudyName))})\.(csv|png|svg|pdf)"),

@@ -128,7 +128,7 @@ class Check(NamedTuple):
     """A check and its finding; `more` has the details. A fact is a check that is neither good nor bad."""
 
     grade: Grade
-    what: str
+    name: str
     text: str
     more: tuple[str, ...] = ()
 
@@ -282,7 +282,7 @@ def _labelled(block: Facts | Checks, verbose: bool) -> Iterator[tuple[str, str, 
             yield of_all if block.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
         return
     for number, row in enumerate(row for row in block.rows if verbose or row.grade != "fact"):
-        first = f"{'' if number else 'checks':{LABEL + 2}}{GRADE_MARKS[row.grade]:4}{row.what:{LABEL + 3}}"
+        first = f"{'' if number else 'checks':{LABEL + 2}}{GRADE_MARKS[row.grade]:4}{row.name:{LABEL + 3}}"
         yield first, row.text, 1 if row.grade == "good" else BRIEF_LINES
         yield from ((" " * len(first), more, BRIEF_LINES) for more in (row.more if verbose else ()))
 

@@ -181,13 +181,13 @@ def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
     numbers = []
     for level in levels:
         name, case, by_run = level.setting.series, consistency_of(level.found), level.metrics()
-        for what, words in CONSISTENCY_WORDS.items():
-            low, high = case[what]["band"]
-            expected = f"{case[what]['expected']:g}, {low:.3f}-{high:.3f} in 95 %"
-            numbers.append(StudyNumber(f"{name}: {words}, mean", (case[what]["mean"],), "", expected))
-            numbers.append(StudyNumber(f"{name}: {words}, median run", (by_run[what]["p50"],), ""))
-        for what, part in (("pose", case["coverage_pct"][:3]), ("ICRs", case["coverage_pct"][3:])):
-            label = f"{name}: {what} within 2 sigma, least and most"
+        for quantity, words in CONSISTENCY_WORDS.items():
+            low, high = case[quantity]["band"]
+            expected = f"{case[quantity]['expected']:g}, {low:.3f}-{high:.3f} in 95 %"
+            numbers.append(StudyNumber(f"{name}: {words}, mean", (case[quantity]["mean"],), "", expected))
+            numbers.append(StudyNumber(f"{name}: {words}, median run", (by_run[quantity]["p50"],), ""))
+        for states, part in (("pose", case["coverage_pct"][:3]), ("ICRs", case["coverage_pct"][3:])):
+            label = f"{name}: {states} within 2 sigma, least and most"
             numbers.append(StudyNumber(label, (min(part), max(part)), "%", "95.4 %"))
     return numbers
 

@@ -124,13 +124,13 @@ def consistency_of(found: Mapping[str, Floats]) -> dict[str, Any]:
     case: dict[str, Any] = {
         "nees": {"mean": float(nees.mean()), "expected": 6.0, "band": (low, high), "stops_in_band_pct": in_band}
     }
-    for what, degrees in (("nis_gnss", 2), ("nis_heading", 1)):
-        finite = found[f"all {what}"][np.isfinite(found[f"all {what}"])]
+    for quantity, degrees in (("nis_gnss", 2), ("nis_heading", 1)):
+        finite = found[f"all {quantity}"][np.isfinite(found[f"all {quantity}"])]
         band = chi2_band(degrees * len(finite), len(finite))
-        case[what] = {"mean": float(finite.mean()), "expected": float(degrees), "band": band}
+        case[quantity] = {"mean": float(finite.mean()), "expected": float(degrees), "band": band}
     return case | {
         "states": list(STUDY_STATES),
-        "by_run": {what: statistics(found[what]) for what in case},
+        "by_run": {quantity: statistics(found[quantity]) for quantity in case},
         "coverage_pct": (100 * (np.abs(ratio) <= 2).mean(axis=(0, 1))).tolist(),
         "rms_error_over_std": np.sqrt((ratio**2).mean(axis=(0, 1))).tolist(),
     }
@@ -146,9 +146,11 @@ def statistics(values: Floats) -> dict[str, float]:
     return {"count": len(finite), "mean": mean, "std": std, "p5": low, "p50": middle, "p95": high}
 
 
-How = Literal["spread", "median", "mean", "percent", "percent found", "range of means", "extreme medians", "first"]
+Statistic = Literal[
+    "spread", "median", "mean", "percent", "percent found", "range of means", "extreme medians", "first"
+]
 
-HOW: dict[How, Callable[[Sequence[Floats]], tuple[float, ...]]] = {
+STATISTICS: dict[Statistic, Callable[[Sequence[Floats]], tuple[float, ...]]] = {
     "spread": lambda levels: _percentiles(np.concatenate(levels)),
     "median": lambda levels: (_middle(np.concatenate(levels)),),
     "mean": lambda levels: (statistics(np.concatenate(levels))["mean"],),
@@ -180,18 +182,18 @@ class Number(NamedTuple):
 
     Attributes
     ----------
-    what : its name, with {series}, {value} and {icr}; levels with the same name are joined
+    label : its name, with {series}, {value} and {icr}; levels with the same name are joined
     columns : pattern of the columns that it is computed from, with {icr}
-    how : its computation, a key of `HOW`
+    statistic : name of its computation, a key of `STATISTICS`
     unit : of the number
     paper : the paper's number as text, or a mapping from value or series to text, with an empty key for all others
     at : the values for which it is reported, or a function that chooses them
     series : the only series for which it is reported; empty: all
     """
 
-    what: str
+    label: str
     columns: str
-    how: How
+    statistic: Statistic
     unit: str = ""
     paper: str | Mapping[Any, str] = ""
     at: Sequence[Any] | Callable[[Sequence[Any]], Sequence[Any]] = tuple
@@ -300,15 +302,17 @@ def reported_numbers(numbers: Sequence[Number], levels: Sequence[Level]) -> list
         for icr in ICR_NAMES:
             for number, values in zip(numbers, at, strict=True):
                 if value in values and number.series in ("", series):
-                    what = number.what.format(series=series, value=value, icr=icr)
+                    label = number.label.format(series=series, value=value, icr=icr)
                     names = fnmatch.filter(level.numbers(), number.columns.format(icr=icr))
                     columns = np.concatenate([level.found[name] for name in names])
-                    pooled.setdefault(what, (number, level, {}))[2][place] = columns
+                    pooled.setdefault(label, (number, level, {}))[2][place] = columns
     numbers_found = []
-    for what, (number, level, by_level) in pooled.items():
+    for label, (number, level, by_level) in pooled.items():
         paper = number.paper
         if not isinstance(paper, str):
             keys = (level.setting.value, level.setting.series, "")
             paper = next((paper[key] for key in keys if key in paper), "")
-        numbers_found.append(StudyNumber(what, HOW[number.how](list(by_level.values())), number.unit, paper))
+        numbers_found.append(
+            StudyNumber(label, STATISTICS[number.statistic](list(by_level.values())), number.unit, paper)
+        )
     return numbers_found

@@ -144,7 +144,7 @@ def run_scenarios(
             if progress is not None:
                 progress(len(done) / len(jobs))
     of_scenarios = (done[first : first + runs] for first in range(0, len(done), runs))
-    return [{name: np.array([found[name] for found in some]) for name in some[0]} for some in of_scenarios]
+    return [{name: np.array([found[name] for found in results]) for name in results[0]} for results in of_scenarios]
 
 
 def _filtered(scenario: Scenario, run: int, seed: int) -> StudyRun:

@@ -144,7 +144,7 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | No
     sheet = new_sheet(answer, f"{name}: {windows}", ax, **layout)
     place, heading, turn = sheet.subplots(1, 3)[0]
     looks = BEFORE_LOOK, AFTER_LOOK
-    for axes, sizes, unit, of in (
+    for axes, sizes, unit, measured in (
         (place, off_m, " m", "the place"), (heading, [np.abs(part) for part in turns], "°", "the heading change"),
     ):  # fmt: skip
         for size, look in zip(sizes, looks, strict=True):
@@ -155,7 +155,7 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | No
                  for share, before, after in zip(SHARES_PCT, *marks, strict=True))  # fmt: skip
         axes.set_title("\n".join(texts), loc="left", pad=5.0, fontsize=8.5)
         end = max(REST_SHOWN * max(float(mark[-1]) for mark in marks), 1e-3)
-        axes.set(xlim=(0.0, end), ylim=(0.0, 100.0), xlabel=f"Residual of {of} [{unit.strip()}]")
+        axes.set(xlim=(0.0, end), ylim=(0.0, 100.0), xlabel=f"Residual of {measured} [{unit.strip()}]")
     place.set_ylabel("Windows below [%]")
     heading.tick_params(labelleft=False)
     turned_deg = np.degrees(residuals.turn_rad)
@@ -390,8 +390,8 @@ def _draw_over_dates(sheet: Sheet, points: Sequence[FleetLog]) -> None:
     for axes, (side, icrs_of_side) in zip(panels, icrs.items(), strict=True):
         stds = [point.icr.get(f"std_y_icr_{side}_m") or 0.0 for point in points]
         for robot, look in zip(robots, cycle(GROUP_LOOKS), strict=False):
-            mine = [point.robot == robot for point in points]
-            columns = (list(compress(column, mine)) for column in (days, icrs_of_side, stds))
+            is_robot = [point.robot == robot for point in points]
+            columns = (list(compress(column, is_robot)) for column in (days, icrs_of_side, stds))
             axes.errorbar(*columns, markersize=4.5, capsize=2.0, linewidth=1.0, label=_key_of(robot), **look)
         axes.set_ylabel(f"ICR y {side} [m]")
     first, last = panels[-1].get_xlim()

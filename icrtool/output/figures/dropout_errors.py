@@ -96,11 +96,11 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     bars = [model for model in models[1:] if not row_of(model.name).compared]
     for model in models:
         crossings = [
-            (found.distance_m, found.budget_m) for found in reached if found.model == model.name and not found.beyond
+            (reach.distance_m, reach.budget_m) for reach in reached if reach.model == model.name and not reach.beyond
         ]
         # A line begins where trials do, or where its model has used up the budget.
         if row_of(model.name).compared:
-            crossings = [found for found in crossings if found[0] >= horizons_m[0]]
+            crossings = [crossing for crossing in crossings if crossing[0] >= horizons_m[0]]
         curves.append(_draw_model(axes, model, horizons_m, crossings, pens[model.name], first=model is first))
         if model in bars:
             shift_m = BAR_STEP * float(horizons_m[-1]) * (bars.index(model) + 1) * (-1) ** bars.index(model)
@@ -188,9 +188,10 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | Non
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
-    asked = [_place(report, metres) for metres in horizons_m]
+    numbers = [_place(report, metres) for metres in horizons_m]
     of_models = (
-        (result, [h for h in asked if len(result.histograms[h].left)]) for result in (*_models(report), *report.results)
+        (result, [h for h in numbers if len(result.histograms[h].left)])
+        for result in (*_models(report), *report.results)
     )
     model, places = next(drawn for drawn in of_models if drawn[1])
     budgets_m = dict.fromkeys(reach.budget_m for reach in report.document.budgets)

@@ -79,9 +79,9 @@ def dropout_examples(report: DropoutReport, *, ax: Axes | None = None) -> Figure
     examples = _needed(report, report.examples, "example trials")
     trials = [example.document for example in examples]
     errors = " and ".join(error_text(trial.errors_m[trial.model]) for trial in trials)
-    what = "about half a turn (left), as straight as the drive has it (right)"
+    kinds_text = "about half a turn (left), as straight as the drive has it (right)"
     title = f"Typical trials of {trials[0].horizon_m:g} m end {errors} off"
-    subtitle = f"{run_title(report.run_document)}: {what}"
+    subtitle = f"{run_title(report.run_document)}: {kinds_text}"
     sheet = new_sheet(title, subtitle, ax, height_in=4.9, margins_in=(0.75, 0.2, 1.2, 0.9), wspace=0.34)
     panels = sheet.subplots(1, len(examples))[0]
     across, up = direction_words(report.run_document)
@@ -114,9 +114,9 @@ def dropout_worst(report: DropoutReport, *, ax: Axes | None = None) -> Figure | 
     worst = _needed(report, report.worst, "worst trials")[: WORST_COLUMNS * WORST_ROWS - 1]
     first = worst[0].document
     rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), first.model
-    which = f"{model}, the {len(worst)} worst trials, none overlapping"
+    subtitle = f"{model}, the {len(worst)} worst trials, none overlapping"
     title = f"The worst trial of {first.horizon_m:g} m ends {error_text(first.errors_m[model])} off"
-    subtitle, height_in = f"{run_title(report.run_document)}: {which}", 1.0 + rows * (WORST_CELL_IN + 0.5)
+    subtitle, height_in = f"{run_title(report.run_document)}: {subtitle}", 1.0 + rows * (WORST_CELL_IN + 0.5)
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, **WORST_LAYOUT)
     panels = sheet.subplots(rows, WORST_COLUMNS).ravel()
     for axes in panels:
@@ -337,9 +337,11 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
 Content = TypeVar("Content", ExampleTrial, Outage, PathErrors)
 
 
-def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> tuple[Content, ...]:
+def _needed(report: DropoutReport, content: tuple[Content, ...], content_word: str) -> tuple[Content, ...]:
     if not content:
-        raise DataError(report.name, f"the report holds no {what}", "icrtool.dropout_report finds what there is")
+        raise DataError(
+            report.name, f"the report holds no {content_word}", "icrtool.dropout_report finds what there is"
+        )
     return content
 
 

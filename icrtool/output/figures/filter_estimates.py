@@ -243,10 +243,10 @@ def gnss_difference(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     """
     facts, duration_s, fixes = run.document.gnss, float(run.table.t_s[-1]), run.sensors.fixes
     mean, most = facts.mean_difference_m, facts.max_difference_m
-    of, word = facts.used + facts.rejected, position_word(run.document)
+    count, word = facts.used + facts.rejected, position_word(run.document)
     apart = f"{error_text(mean)} from the {word} on average, " if mean is not None else ""
-    title = f"Filter {apart}{100 * facts.rejected / max(of, 1):.0f} % rejected"
-    subtitle = f"{run_title(run.document)}: distance between filter and {word}, {of:,} of them"
+    title = f"Filter {apart}{100 * facts.rejected / max(count, 1):.0f} % rejected"
+    subtitle = f"{run_title(run.document)}: distance between filter and {word}, {count:,} of them"
     sheet = new_sheet(title, subtitle, ax, height_in=3.9)
     axes = sheet.subplots()[0, 0]
     name, unit = _time_axis(duration_s)

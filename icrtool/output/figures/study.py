@@ -259,7 +259,7 @@ def coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
 
 
 SETTLING_LINES: Draw = partial(over, columns=_by_icr("settle_{icr}_s"))
-MEANS, SCATTER = (partial(over, columns=_by_icr(f"{what}_{{icr}}_m")) for what in ("mean", "scatter"))
+MEANS, SCATTER = (partial(over, columns=_by_icr(f"{statistic}_{{icr}}_m")) for statistic in ("mean", "scatter"))
 RMS: Draw = partial(over, columns=_by_icr("rms_{icr}_m"), log="xy")
 WITHOUT_GNSS: Draw = partial(
     over, columns={"blind_icr_10m_p95_m": OPEN_LOOP, "blind_no_slip_10m_p95_m": OPEN_LOOP_NO_SLIP}, log="xy"

@@ -227,10 +227,10 @@ def row_pens(names: Iterable[str]) -> dict[str, Look]:
     return {name: line_look(COLORS[row.color], DASHES[row.dash], ROW_WIDTH * row.width) for name, row in rows}
 
 
-def logarithmic_errors(axes: Axes, of: Literal["x", "y"] = "x") -> None:
-    """Give an axis errors [m] on a logarithmic scale with plain numbers."""
-    axes.set(**{f"{of}scale": "log", f"{of}label": "Error [m], logarithmic"})
-    axis: Axis = getattr(axes, f"{of}axis")
+def logarithmic_errors(axes: Axes, direction: Literal["x", "y"] = "x") -> None:
+    """Set one axis to a logarithmic scale of errors [m], with plain numbers; `direction` is the axis."""
+    axes.set(**{f"{direction}scale": "log", f"{direction}label": "Error [m], logarithmic"})
+    axis: Axis = getattr(axes, f"{direction}axis")
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())

@@ -27,7 +27,7 @@ from icrtool.errors import OutputError
 from icrtool.records.places import Below, Place, open_regular, path_of
 from icrtool.records.process_resources import mark_finished, mark_unfinished, remove_path, unfinished
 
-IsOurFile = Callable[[bytes], bool]
+MayReplace = Callable[[bytes], bool]
 """Whether icrtool wrote a file and may replace it, by the first bytes of the file."""
 
 EXPORTED_MCAP = b"icrtool export"
@@ -41,7 +41,7 @@ RECOGNISED_BYTES = 4096
 HIDDEN = ".icrtool-"
 """Begin of the names of icrtool's files that are not results."""
 
-OF_NOBODY = {".DS_Store", "Thumbs.db", "desktop.ini"}
+FILE_MANAGER_FILES = {".DS_Store", "Thumbs.db", "desktop.ini"}
 """Names of files that file managers write into the folders they show."""
 
 PARTIAL_SUFFIX, OLD_SUFFIX = ".partial", ".old"
@@ -60,18 +60,18 @@ AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Constants of Linux, from <fcntl.h> and <linux/fs.h>."""
 
 
-class Kind(NamedTuple):
+class DirectoryKind(NamedTuple):
     """A kind of directory that icrtool writes.
 
     Attributes
     ----------
     name : for messages ("run directory")
-    is_one : whether a directory is one
+    recognises : whether a directory is one
     files : matches the names of all files and directories that icrtool writes below it; a directory ends in ``/``
     """
 
     name: str
-    is_one: Callable[[Path], bool]
+    recognises: Callable[[Path], bool]
     files: re.Pattern[str]
 
 
@@ -84,7 +84,7 @@ def place_errors(place: Place) -> Iterator[None]:
         raise OutputError(path_of(place), "cannot be written", err.strerror or str(err)) from err
 
 
-def check_place(file: Place, ours: IsOurFile | None = None) -> None:
+def check_place(file: Place, ours: MayReplace | None = None) -> None:
     """Refuse a place where a file cannot be put, before any work is done for it.
 
     Parameters
@@ -102,7 +102,7 @@ def check_place(file: Place, ours: IsOurFile | None = None) -> None:
             raise OutputError(path_of(file), "its directory does not exist", "make it first, or name another file")
 
 
-def _target_of(file: Place, ours: IsOurFile | None) -> Path:
+def _target_of(file: Place, ours: MayReplace | None) -> Path:
     """Return the path of a file without links; parameters and errors as in `check_place`."""
     path = path_of(file)
     if isinstance(file, Below):
@@ -129,7 +129,7 @@ def _target_of(file: Place, ours: IsOurFile | None) -> Path:
 
 
 @contextmanager
-def atomic_file(file: Place, ours: IsOurFile | None = None) -> Iterator[Path]:
+def atomic_file(file: Place, ours: MayReplace | None = None) -> Iterator[Path]:
     """Give a hidden path in the folder of a file to write to; at the block's end it is synced and moved to its place.
 
     Parameters
@@ -149,7 +149,7 @@ def atomic_file(file: Place, ours: IsOurFile | None = None) -> Iterator[Path]:
         put_in_place(partial, _target_of(file, ours))
 
 
-def write_file(file: Place, content: str | bytes, ours: IsOurFile | None = None) -> None:
+def write_file(file: Place, content: str | bytes, ours: MayReplace | None = None) -> None:
     """Write a file, whole or not at all; a text is written in UTF-8, with escapes for invalid characters.
 
     Parameters
@@ -178,7 +178,7 @@ def make_folders(folder: Below) -> None:
         folder.path.mkdir(parents=True, exist_ok=True)
 
 
-def check_directory(directory: Place, kind: Kind) -> None:
+def check_directory(directory: Place, kind: DirectoryKind) -> None:
     """Refuse a place where a directory of a kind cannot be put; restore an old one that a killed process renamed.
 
     Parameters
@@ -204,7 +204,7 @@ def check_directory(directory: Place, kind: Kind) -> None:
         if file := next((path for path in (place, *place.parents) if path.exists() and not path.is_dir()), None):
             why = "a file is there" if file == place else f"{file} is a file"
             advice = f"name another place for the {kind.name}"
-        elif not kind.is_one(place):
+        elif not kind.recognises(place):
             if next(names, None) is not None:
                 why = f"holds something that is not a {kind.name}"
         elif other := next((name for name in names if not kind.files.fullmatch(name)), None):
@@ -242,13 +242,13 @@ def names_in(directory: Path) -> Iterator[str]:
         folders[:] = [name for name in folders if not name.startswith(HIDDEN)]
         for name in (*folders, *files):
             path = Path(place, name)
-            if name not in OF_NOBODY and not name.startswith(HIDDEN):
+            if name not in FILE_MANAGER_FILES and not name.startswith(HIDDEN):
                 slash = "/" if name in folders and not path.is_symlink() else ""
                 yield path.relative_to(directory).as_posix() + slash
 
 
 @contextmanager
-def atomic_directory(directory: Place, kind: Kind) -> Iterator[Path]:
+def atomic_directory(directory: Place, kind: DirectoryKind) -> Iterator[Path]:
     """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
 
     Parameters
@@ -285,9 +285,9 @@ def partial_at(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
     for abandoned in list(place.parent.glob(_hidden_name(place, "*-*-*"))):
         # An old directory under a hidden name is kept as long as nothing is in its place.
         with suppress(FileNotFoundError):
-            if _is_left(abandoned) and (abandoned.suffix == PARTIAL_SUFFIX or place.exists()):
+            if _has_no_writer(abandoned) and (abandoned.suffix == PARTIAL_SUFFIX or place.exists()):
                 remove_path(abandoned)
-    partial = place.with_name(_hidden_name(place, writer(), PARTIAL_SUFFIX))
+    partial = place.with_name(_hidden_name(place, writer_id(), PARTIAL_SUFFIX))
     with unfinished(partial):
         try:
             make(partial)
@@ -301,21 +301,21 @@ def _hidden_name(place: Path, writer: str, suffix: str = "") -> str:
     return f"{HIDDEN}{blake2b(os.fsencode(place.name), digest_size=8).hexdigest()}-{writer}{suffix}"
 
 
-def writer() -> str:
+def writer_id() -> str:
     """Return host and process of this command, with random letters: for a hidden name, or a claim to an address."""
     return f"{crc32(platform.node().encode()):08x}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
-def _is_left(path: Path) -> bool:
+def _has_no_writer(path: Path) -> bool:
     """Return whether no process writes a hidden file: its process has ended, or it is `ABANDONED_S` old."""
-    return not has_process("-".join(path.name.split("-")[-3:])) or path.lstat().st_mtime < time.time() - ABANDONED_S
+    return not may_still_write("-".join(path.name.split("-")[-3:])) or path.lstat().st_mtime < time.time() - ABANDONED_S
 
 
-def has_process(stated: str) -> bool:
+def may_still_write(stated: str) -> bool:
     """Return whether the process that `writer` states may still write; True where that cannot be known."""
     host, _, rest = stated.partition("-")
     number = rest.partition("-")[0]
-    if sys.platform != "linux" or not writer().startswith(f"{host}-") or not number.isdecimal():
+    if sys.platform != "linux" or not writer_id().startswith(f"{host}-") or not number.isdecimal():
         return True
     return Path("/proc", number).exists()
 
@@ -333,7 +333,7 @@ def put_in_place(partial: Path, place: Path) -> None:
     if not place.is_dir():
         partial.replace(place)
     elif not _exchange(partial, place):
-        old = place.with_name(_hidden_name(place, writer(), OLD_SUFFIX))
+        old = place.with_name(_hidden_name(place, writer_id(), OLD_SUFFIX))
         place.rename(old)
         try:
             partial.rename(place)

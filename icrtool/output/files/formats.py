@@ -229,7 +229,7 @@ def write_sums(directory: Path, sums: Mapping[str, str]) -> None:
     write_file(Below(directory, CHECKSUM_FILE), "".join(lines))
 
 
-def list_anew(directory: Path, part: str, names: Iterable[str] = ()) -> None:
+def relist_files(directory: Path, part: str, names: Iterable[str] = ()) -> None:
     """Replace the files of a part of a run in the run's list; a directory without a list gets none.
 
     Parameters

@@ -2,7 +2,7 @@
 
 Of several commands that upload to one address at the same time, the first one claims it; the others change nothing.
 
-Only this module writes over a connection. All others write to a folder on disk, which `on_disk` gives them.
+Only this module writes over a connection. All others write to a folder on disk, which `folder_on_disk` gives them.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from icrtool.errors import IcrToolError, LogError, OutputError
 from icrtool.logs.containers.connection import ask_server, filesystem
 from icrtool.logs.containers.source import version_of
 from icrtool.logs.containers.unpack import ScratchFolder
-from icrtool.output.files.atomic import ABANDONED_S, has_process, make_folders, place_errors, write_file, writer
+from icrtool.output.files.atomic import ABANDONED_S, make_folders, may_still_write, place_errors, write_file, writer_id
 from icrtool.output.files.formats import CHECKSUM_FILE, SOURCES_FILE
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import Below, UrlPath
 
 Result = TypeVar("Result")
 
-COUNTS = (CHECKSUM_FILE, FLEET_FILE)
+VALIDITY_FILES = (CHECKSUM_FILE, FLEET_FILE)
 """Files without which a run or a batch is not valid. They are removed before anything is replaced, and uploaded
 last."""
 
@@ -54,7 +54,7 @@ def is_document(name: str) -> bool:
 
 
 @contextmanager
-def on_disk(
+def folder_on_disk(
     place: Path,
     needed: Needed = is_document,
     parts: Collection[str] | None = None,
@@ -120,7 +120,7 @@ def write_below(folder: Path, name: str, content: bytes) -> None:
     write_file(Below(folder, name), content)
 
 
-def lies_there(place: UrlPath, name: str) -> bool:
+def has_file(place: UrlPath, name: str) -> bool:
     """Return whether an object store has a file of this name below an address."""
     if place.scheme.startswith("http"):
         return False
@@ -144,7 +144,7 @@ class _Store:
 
     def put(self, content: bytes, name: str = "") -> None:
         """Write a file."""
-        self._done(lambda: self._files.pipe_file(self._of(name), content))
+        self._ask(lambda: self._files.pipe_file(self._address_of(name), content))
 
     def fetch(self, folder: Path, needed: Needed, parts: Collection[str] | None) -> dict[str, tuple[int, int]]:
         """Copy the address to the folder on disk.
@@ -155,8 +155,8 @@ class _Store:
             Numbers that identify the content of the files, by their names.
         """
         names = []
-        self._found = self._what_counts()
-        for name in self._names(parts):
+        self._found = self._validity_facts()
+        for name in self._list_files(parts):
             # Anybody may have written the name: it must be the name of a file below the folder.
             path = PurePosixPath(name)
             below = name and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
@@ -166,30 +166,32 @@ class _Store:
             for name in names:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / name).touch(exist_ok=False)
-        self._each(lambda name: self._files.get_file(self._of(name), str(folder / name)), filter(needed, names))
+        self._ask_for_each(
+            lambda name: self._files.get_file(self._address_of(name), str(folder / name)), filter(needed, names)
+        )
         return {name: _identity(folder / name) for name in names}
 
     def upload(self, folder: Path, before: dict[str, tuple[int, int]]) -> None:
         """Copy the folder on disk to the address."""
-        there = [path for path in folder.rglob("*") if path.is_file() and path.stat().st_size]
-        now = {path.relative_to(folder).as_posix(): _identity(path) for path in there}
+        files_now = [path for path in folder.rglob("*") if path.is_file() and path.stat().st_size]
+        now = {path.relative_to(folder).as_posix(): _identity(path) for path in files_now}
         gone = [name for name in before if not (folder / name).exists()]
         changed = [name for name, identity in now.items() if identity != before.get(name)]
         if not changed and not gone:
             return
-        claim = self._claim()
+        claim = self._take_claim()
         try:
-            if self._what_counts() != self._found:
+            if self._validity_facts() != self._found:
                 advice = "its results stay; name another place, or run the command again"
                 raise OutputError(self._place, "another command wrote there meanwhile", advice)
-            last = [name for name in COUNTS if name in now]
-            self.remove([name for name in COUNTS if name in before])
-            self.remove([name for name in gone if name not in COUNTS])
+            last = [name for name in VALIDITY_FILES if name in now]
+            self.remove([name for name in VALIDITY_FILES if name in before])
+            self.remove([name for name in gone if name not in VALIDITY_FILES])
             # The first files, run.json among them, show that the rest of an interrupted upload is icrtool's.
             first = [name for name in changed if name.endswith(".json") and name not in last]
             for names in (first, [name for name in changed if name not in {*first, *last}], last):
                 self._check_claim(claim)
-                self._each(partial(self._put_file, folder, claim), names)
+                self._ask_for_each(partial(self._put_file, folder, claim), names)
         finally:
             # Without a connection it stays, and the next command of this host sees that its process is gone.
             with suppress(IcrToolError):
@@ -200,9 +202,9 @@ class _Store:
         """Copy a file of the folder to the address."""
         if time.time() > self._checked_s + CLAIM_CHECKED_S:
             self._check_claim(claim)
-        self._files.put_file(str(folder / name), self._of(name))
+        self._files.put_file(str(folder / name), self._address_of(name))
 
-    def _claim(self) -> bytes:
+    def _take_claim(self) -> bytes:
         """Write a claim to the place, where there is none of a living command, and return it.
 
         The store itself sees to it that of several commands only one can write the claim: all others end before they
@@ -213,27 +215,27 @@ class _Store:
         OutputError
             Another command writes there.
         """
-        claim = f"{writer()} {time.time():.0f}".encode()
-        if not self._create(claim):
-            other = self._claim_there()
+        claim = f"{writer_id()} {time.time():.0f}".encode()
+        if not self._write_claim(claim):
+            other = self._read_claim()
             if not _is_abandoned(other):
                 minutes = max(time.time() - _time_of(other), 0.0) / 60
                 why = f"another command has been writing there for {minutes:.0f} min"
                 advice = f"its results stay; wait for its end, or remove {_CLAIM} there where it was killed"
                 raise OutputError(self._place, why, advice)
             self.remove([_CLAIM])
-            if not self._create(claim):
-                self._refuse()
+            if not self._write_claim(claim):
+                self._raise_claimed()
         # A store that writes the second claim over the first one gives it to both.
         self._check_claim(claim)
         return claim
 
-    def _create(self, claim: bytes) -> bool:
+    def _write_claim(self, claim: bytes) -> bool:
         """Write the claim where no other is there; return whether it was written."""
 
-        def write(**how: str) -> int:
+        def write(**options: str) -> int:
             try:
-                self._files.pipe_file(self._of(_CLAIM), claim, **how)
+                self._files.pipe_file(self._address_of(_CLAIM), claim, **options)
             except OSError as err:
                 if isinstance(err, FileExistsError) or err.errno in (errno.EINVAL, errno.EBUSY):
                     return errno.EEXIST
@@ -242,62 +244,65 @@ class _Store:
                 return errno.ENOSYS
             return 0
 
-        answer = self._done(lambda: write(mode="create"))
+        answer = self._ask(lambda: write(mode="create"))
         # Some stores know no conditional writes.
-        return not (self._done(write) if answer == errno.ENOSYS else answer)
+        return not (self._ask(write) if answer == errno.ENOSYS else answer)
 
-    def _claim_there(self) -> bytes:
+    def _read_claim(self) -> bytes:
         """Return the claim at the place; empty where there is none."""
 
         def ask() -> bytes:
             self._files.invalidate_cache()
             try:
-                return bytes(self._files.cat_file(self._of(_CLAIM), end=_LONGEST_CLAIM))
+                return bytes(self._files.cat_file(self._address_of(_CLAIM), end=_LONGEST_CLAIM))
             except FileNotFoundError:
                 return b""
 
-        return self._done(ask)
+        return self._ask(ask)
 
     def _check_claim(self, claim: bytes) -> None:
         """Refuse to continue where another command claimed the place at the same time."""
-        if self._claim_there() != claim:
-            self._refuse()
+        if self._read_claim() != claim:
+            self._raise_claimed()
         self._checked_s = time.time()
 
-    def _refuse(self) -> NoReturn:
+    def _raise_claimed(self) -> NoReturn:
         why = "another command began to write there at the same time"
         raise OutputError(self._place, why, "its results stay; run this command again")
 
-    def _what_counts(self) -> list[object]:
+    def _validity_facts(self) -> list[object]:
         """Return the store's facts about the files without which results are not valid."""
-        return [(about.get("size"), version_of(about)) if (about := self._about(name)) else None for name in COUNTS]
+        return [
+            (about.get("size"), version_of(about)) if (about := self._facts_of(name)) else None
+            for name in VALIDITY_FILES
+        ]
 
-    def _about(self, name: str) -> dict[str, Any]:
+    def _facts_of(self, name: str) -> dict[str, Any]:
         """Return the store's present facts about a file; empty where there is none."""
 
         def ask() -> dict[str, Any]:
             self._files.invalidate_cache()
             try:
-                facts: dict[str, Any] = self._files.info(self._of(name))
+                facts: dict[str, Any] = self._files.info(self._address_of(name))
             except FileNotFoundError:
                 return {}
             return facts
 
-        return self._done(ask)
+        return self._ask(ask)
 
-    def _names(self, parts: Collection[str] | None) -> list[str]:
+    def _list_files(self, parts: Collection[str] | None) -> list[str]:
         """Return the files below the address."""
         self._files.invalidate_cache()
         if parts is None:
-            names = self._done(lambda: self._files.find(self._name))
+            names = self._ask(lambda: self._files.find(self._name))
         else:
-            names = self._done(self._at_top)
-            names += self._done(lambda: [name for part in parts for name in self._files.find(self._of(part))])
+            names = self._ask(self._list_top_files)
+            names += self._ask(lambda: [name for part in parts for name in self._files.find(self._address_of(part))])
         if names == [self._name]:
             raise OutputError(self._place, "a file is there", "name another place")
         return [name.removeprefix(f"{self._name}/") for name in names]
 
-    def _at_top(self) -> list[str]:
+    def _list_top_files(self) -> list[str]:
         # `find` with a depth lists all files at az://, and ignores errors at s3://.
         try:
             entries = self._files.ls(self._name, detail=True)
@@ -305,19 +310,19 @@ class _Store:
             return []
         return [entry["name"] for entry in entries if entry["type"] == "file"]
 
-    def _of(self, name: str) -> str:
+    def _address_of(self, name: str) -> str:
         return f"{self._name}/{name}" if name else self._name
 
     def remove(self, names: list[str]) -> None:
         """Remove files."""
-        self._each(lambda name: self._files.rm_file(self._of(name)), names)
+        self._ask_for_each(lambda name: self._files.rm_file(self._address_of(name)), names)
 
-    def _each(self, request: Callable[[str], object], names: Iterable[str]) -> None:
+    def _ask_for_each(self, request: Callable[[str], object], names: Iterable[str]) -> None:
         """Make a request for each file, several at the same time."""
         with ThreadPoolExecutor(MOST_REQUESTS) as pool:
-            list(pool.map(lambda name: self._done(lambda: request(name)), names))
+            list(pool.map(lambda name: self._ask(lambda: request(name)), names))
 
-    def _done(self, request: Callable[[], Result]) -> Result:
+    def _ask(self, request: Callable[[], Result]) -> Result:
         """Return the answer to a request."""
         with place_errors(self._place), _as_output(self._place):
             return ask_server(self._place, request, done=self._what_is_done)
@@ -343,8 +348,8 @@ def _is_abandoned(claim: bytes) -> bool:
     """Return whether the command that wrote a claim is gone: its process has ended, or it wrote an hour ago."""
     stated = claim.partition(b" ")[0].decode("ascii", "replace")
     # A process writes to a place once at a time: its own claim is left from a broken connection.
-    is_own = stated.rpartition("-")[0] == writer().rpartition("-")[0]
-    return is_own or not has_process(stated) or _time_of(claim) < time.time() - ABANDONED_S
+    is_own = stated.rpartition("-")[0] == writer_id().rpartition("-")[0]
+    return is_own or not may_still_write(stated) or _time_of(claim) < time.time() - ABANDONED_S
 
 
 def _identity(file: Path) -> tuple[int, int]:

@@ -267,8 +267,8 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, Dropo
     report_notes = report.notes
     if cause:
         notes, report_notes = (
-            tuple(changed(finding, text=finding.text.replace(cause, "its cause is left out")) for finding in some)
-            for some in (notes, report_notes)
+            tuple(changed(finding, text=finding.text.replace(cause, "its cause is left out")) for finding in findings)
+            for findings in (notes, report_notes)
         )
     document_without = changed(
         document,
@@ -411,7 +411,9 @@ def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
 
 def _error_cell(log: FleetLog, model: str) -> Cell:
     """Return the error of a model in a log at `CHOICE_HORIZON_M`, with its interval where that is known."""
-    p95, low, high = (log.errors.get(f"{model}_{of}_{CHOICE_HORIZON_M:g}m_m") for of in ("p95", "p95_low", "p95_high"))
+    p95, low, high = (
+        log.errors.get(f"{model}_{number}_{CHOICE_HORIZON_M:g}m_m") for number in ("p95", "p95_low", "p95_high")
+    )
     interval = "" if low is None or high is None else f"{error_text(low).removesuffix(' m')}-{error_text(high)}"
     return _cell(p95, error_text)._replace(more=(interval,) if interval else ())
 
@@ -503,12 +505,12 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
     )  # fmt: skip
 
 
-def _comparison_answer(found: GroupComparison, verdict: Section) -> Section:
+def _comparison_answer(comparison: GroupComparison, verdict: Section) -> Section:
     """Return the errors of the groups and their differences as cards, with the verdicts."""
     at = f"after {CHOICE_HORIZON_M:g} m"
-    own = (cell for cell in found.transfer if cell.calibrated_on == cell.tested_on)
-    rows = [_row_of_errors(cell.tested_on, cell, "") for cell in own if cell.horizon_m == CHOICE_HORIZON_M]
-    for pair in found.pairs:
+    own_errors = (cell for cell in comparison.transfer if cell.calibrated_on == cell.tested_on)
+    rows = [_row_of_errors(cell.tested_on, cell, "") for cell in own_errors if cell.horizon_m == CHOICE_HORIZON_M]
+    for pair in comparison.pairs:
         at_choice = (difference for difference in pair.errors if difference.horizon_m == CHOICE_HORIZON_M)
         rows += [_row_of_errors(f"{pair.second} − {pair.first}", difference, "+") for difference in at_choice]
     errors = Table("lrr", [row for row in rows if row[1]], (f"95 % error {at}", "error", "95 % interval"))

@@ -161,18 +161,18 @@ ROW_HEIGHT, TICKS = 44.0, 4.0
 """Height of a group's row [units of the drawing], and approximate number of ticks of the scale."""
 
 
-def group_sketch(found: GroupComparison) -> GroupErrors:
+def group_sketch(comparison: GroupComparison) -> GroupErrors:
     """Return the 95 % errors of the groups at `CHOICE_HORIZON_M`, each by its own calibration, with 95 % intervals."""
-    own = [
+    own_errors = [
         cell
-        for cell in found.transfer
+        for cell in comparison.transfer
         if cell.horizon_m == CHOICE_HORIZON_M and cell.calibrated_on == cell.tested_on and cell.p95_m is not None
     ]
-    end_m = max((cell.p95_high_m or cell.p95_m or 0.0 for cell in own), default=0.0) or 1.0
+    end_m = max((cell.p95_high_m or cell.p95_m or 0.0 for cell in own_errors), default=0.0) or 1.0
     step_m = float(min(round_steps(end_m / TICKS), key=lambda step: abs(step - end_m / TICKS)))
     scale = (WIDTH - 3.0 * MARGIN) / end_m
     rows = []
-    for number, cell in enumerate(own):
+    for number, cell in enumerate(own_errors):
         low, x, high = (
             None if error is None else round(MARGIN + scale * error, 1)
             for error in (cell.p95_low_m, cell.p95_m, cell.p95_high_m)

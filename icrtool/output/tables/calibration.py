@@ -48,7 +48,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
     calibration, table = result.calibration, result.table
     icrs = [(calibration.geometry[name], calibration.geometry_std[name]) for name in ICR_COLUMNS]
     driven = distance_text(sum(log.distance_m for log in calibration.logs))
-    what = "log" if table.folds[0].whole else "block of distance"
+    part = "log" if table.folds[0].whole else "block of distance"
     rows = [
         _held_out_distance(reached)
         for name in shown_rows(table.rows)
@@ -64,7 +64,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
     return [
         Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
         *blocks_of_numbers(calibration.controller, calibration.width_m, icrs),
-        Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?"),
+        Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {part} left out in turn?"),
         Facts([("not shown", unknown and f"too small for these drives; the usual values are used: {unknown}")]),
         Section(f"Motion model: {model_text(calibration.fitted)}", model, VERBOSE),
     ]
@@ -138,35 +138,35 @@ def sensor_tables(calibration: Calibration) -> list[Block]:
     return [Table("lr", rows, ("sensors, in a further drive", "value ± std"))] if rows else []
 
 
-def _calibration_cards(found: Calibration, icrs: Sequence[tuple[float, float]]) -> list[Section]:
+def _calibration_cards(calibration: Calibration, icrs: Sequence[tuple[float, float]]) -> list[Section]:
     """Return distance and errors, numbers and a drawing of the ICRs as cards."""
-    numbers = blocks_of_numbers(found.controller, found.width_m, icrs)
-    if alone := controller_error_text(found.controller_errors):
+    numbers = blocks_of_numbers(calibration.controller, calibration.width_m, icrs)
+    if alone := controller_error_text(calibration.controller_errors):
         numbers.append(alone)
     title = "The ICRs of the tracks from above, forward up"
     drawing = Figure((), "geometry", (Chart("geometry", title, f"{title}; bars: ±σ; boxes: the tracks."),))
     return [
-        _reach_card(found),
+        _reach_card(calibration),
         Section("Which numbers into the controller?", numbers, name="factors"),
         Section("Where are the ICRs?", [drawing], name="worst-case"),
     ]
 
 
-def _reach_card(found: Calibration) -> Section:
+def _reach_card(calibration: Calibration) -> Section:
     """Return the distance within the budget and the errors, both held out of the fit, as a card."""
-    horizons = sorted({score.horizon_m for score in found.held_out_pooled})
-    pooled = {(score.model, score.horizon_m): score for score in found.held_out_pooled}
-    names = in_order({score.model for score in found.held_out_pooled})
-    what = "each log left out in turn" if len(found.logs) > 1 else "each block of distance left out in turn"
+    horizons = sorted({score.horizon_m for score in calibration.held_out_pooled})
+    pooled = {(score.model, score.horizon_m): score for score in calibration.held_out_pooled}
+    names = in_order({score.model for score in calibration.held_out_pooled})
+    test_words = "each log left out in turn" if len(calibration.logs) > 1 else "each block of distance left out in turn"
     reached: dict[str, BudgetDistance] = {}
     for name in names:
         errors = np.array([pooled[name, h].p95_m if (name, h) in pooled else math.nan for h in horizons])
         if (distance := within_budget(np.array(horizons), errors, BUDGET_M)) is not None:
             reached[name] = BudgetDistance(name, BUDGET_M, *distance)
     lead, text = "not known", "no distance was left out"
-    if (own := reached.get(MAIN_ROW)) is not None:
-        _, lead, _, between = reach_row(own)
-        text = f"within {BUDGET_M:g} m (95 %), by wheel speeds alone with {MAIN_ROW}, {what}"
+    if (main_reach := reached.get(MAIN_ROW)) is not None:
+        _, lead, _, between = reach_row(main_reach)
+        text = f"within {BUDGET_M:g} m (95 %), by wheel speeds alone with {MAIN_ROW}, {test_words}"
         text += f": the errors were measured at {', '.join(f'{h:g}' for h in horizons)} m, so it is {between}" * bool(
             between
         )
@@ -176,11 +176,11 @@ def _reach_card(found: Calibration) -> Section:
     return Section("How far without GNSS?", [table], lead=lead, text=text, name="reach")
 
 
-def _held_out_table(found: Calibration) -> Table:
+def _held_out_table(calibration: Calibration) -> Table:
     """Return p95 and expected error by horizon of each row, over all held-out trials."""
-    horizons = sorted({score.horizon_m for score in found.held_out_pooled})
-    pooled = {(score.model, score.horizon_m): score for score in found.held_out_pooled}
-    names = in_order({score.model for score in found.held_out_pooled})
+    horizons = sorted({score.horizon_m for score in calibration.held_out_pooled})
+    pooled = {(score.model, score.horizon_m): score for score in calibration.held_out_pooled}
+    names = in_order({score.model for score in calibration.held_out_pooled})
     rows = [(name, *(_errors_text(pooled.get((name, horizon))) for horizon in horizons)) for name in names]
     caption = "95 % / expected error [m] of each row, over all that was left out"
     return Table("lr", rows, ("row", *(f"{horizon:g} m" for horizon in horizons)), caption)
@@ -206,9 +206,9 @@ def _errors_text(score: documents.PooledScore | None) -> str:
 
 def held_out_blocks(table: HeldOut) -> list[Block]:
     """Return the leave-one-out table: p95 / expected error by horizon, of all trials together and of the worst fold."""
-    what, tested = "block", "each trial predicted by a fit to the rest of the drive"
+    part, tested = "block", "each trial predicted by a fit to the rest of the drive"
     if table.folds[0].whole:
-        what, tested = "log", "each log left out in turn"
+        part, tested = "log", "each log left out in turn"
     rows = []
     for row in table.scores:
         cells, of_all = [], row.together
@@ -217,7 +217,7 @@ def held_out_blocks(table: HeldOut) -> list[Block]:
             cells.append(f"{of_all.p95[h]:.2f}/{of_all.expected[h]:.2f} ({worst})" if trials else "–")
         rows.append((row.name, *cells))
     return [
-        f"{tested} ({len(table.folds)} {what}s): 95 % / expected error [m] of all trials (of the worst {what})",
+        f"{tested} ({len(table.folds)} {part}s): 95 % / expected error [m] of all trials (of the worst {part})",
         Table("lr", rows, ("model", *(f"{horizon:g} m" for horizon in table.horizons_m))),
     ]
 

@@ -194,11 +194,11 @@ def _distance_to_plan_with(report: DropoutDocument, budget_m: float, row: ReachR
     """
     name, this_drive, next_drive, _ = row
     measured = f"within {budget_m:g} m (95 %), by wheel speeds alone with {name}"
-    found = next((reach for reach in report.budgets if (reach.model, reach.budget_m) == (name, budget_m)), None)
-    if found is None or found.to_plan_with_m is None:
+    planned = next((reach for reach in report.budgets if (reach.model, reach.budget_m) == (name, budget_m)), None)
+    if planned is None or planned.to_plan_with_m is None:
         return this_drive, f"on this drive {measured}"
     then = f"{next_drive} on the next drive on this ground (9 of 10), {this_drive} on this drive"
-    return f"plan with {distance_text(found.to_plan_with_m)}", f"{measured}: {then}"
+    return f"plan with {distance_text(planned.to_plan_with_m)}", f"{measured}: {then}"
 
 
 def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
@@ -241,7 +241,7 @@ def as_good_lines(report: DropoutDocument) -> Iterator[str]:
 def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
     """Return whether the numbers of a report can be trusted, the reasons for care, and what was checked."""
     checks = run_checks(summary)
-    cares = [f"{check.what} {check.text}" for check in checks if check.grade == "care" and check.what != "slip events"]
+    cares = [f"{check.name} {check.text}" for check in checks if check.grade == "care" and check.name != "slip events"]
     if summary.partly_because:
         cares.insert(0, summary.partly_because)
     if events := summary.events:
@@ -271,7 +271,8 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
         (
             f"{rank}", duration_text(trial.t_s), error_text(trial.errors_m[trial.model]),
             error_text(trial.errors_m.get("no_slip")), turn_text(trial.heading_change_deg),
-            f"{trial.speed_mean_mps:.2f} m/s", f"{trial.north_m:z.1f} m", f"{trial.east_m:z.1f} m", _meanwhile(trial, summary, report),
+            f"{trial.speed_mean_mps:.2f} m/s", f"{trial.north_m:z.1f} m", f"{trial.east_m:z.1f} m",
+            _meanwhile(trial, summary, report),
         )
         for rank, trial in enumerate(report.worst, start=1)
     ]  # fmt: skip

@@ -144,8 +144,8 @@ def _source_lines(report: DropoutDocument) -> Iterator[str]:
     if rows and icr is not None:
         nearest = min(rows, key=lambda row: abs(row.horizon_m - CHOICE_HORIZON_M))
         whole = next(row.p95_m for row in icr.by_horizon if row.horizon_m == nearest.horizon_m)
-        what = f"the {error_text(whole)} of icr (95 %, {nearest.horizon_m:g} m)"
-        yield f"up to {error_text(nearest.p95_m)} of {what} can be the error of the position reference"
+        error_words = f"the {error_text(whole)} of icr (95 %, {nearest.horizon_m:g} m)"
+        yield f"up to {error_text(nearest.p95_m)} of {error_words} can be the error of the position reference"
 
 
 def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]:

@@ -75,8 +75,8 @@ def info_blocks(
     rows += overview_rows(log, run) if log is not None else []
     if run is not None:
         # Its advice is among the warnings.
-        _, what, text, more = excitation_check(run.document)
-        rows.append((what, "; ".join((text, *more))))
+        _, name, text, more = excitation_check(run.document)
+        rows.append((name, "; ".join((text, *more))))
     rows += _topic_rows(survey, log)
     notes = run.notes if run is not None else log.notes if log is not None else ()
     rows.append(("warnings", warnings_line(notes)))

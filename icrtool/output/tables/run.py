@@ -264,7 +264,7 @@ def excitation_check(summary: RunDocument) -> Check:
 def _fix_checks(summary: RunDocument) -> Iterator[Check]:
     """Yield checks of the positions: number of used positions, distance of the filter from them, and jumps."""
     gnss, word = summary.gnss, position_word(summary)
-    if of := gnss.used + gnss.rejected:
+    if count := gnss.used + gnss.rejected:
         reasons = {"gate": gnss.rejected_by_gate, **gnss.rejected_by_reason}
         why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
         more = [f"rejected: {why}"] if why else []
@@ -275,14 +275,14 @@ def _fix_checks(summary: RunDocument) -> Iterator[Check]:
         for name, fixes in gnss.classes.items() if len(gnss.classes) > 1 else ():
             done = {"rejected": fixes.rejected, "down-weighted": fixes.down_weighted,
                     "wrongly reported as fixed": fixes.sold_as_fixed}  # fmt: skip
-            parts = ", ".join(f"{count:,} {what}" for what, count in done.items() if count)
+            parts = ", ".join(f"{count:,} {outcome}" for outcome, count in done.items() if count)
             more.append(f"{name} {fixes.fixes:,}{': ' if parts else ''}{parts}")
         if gnss.recoveries:
             times = "once" if gnss.recoveries == 1 else f"{gnss.recoveries:,} times"
             more.append(f"re-acquired after rejection: {times}")
-        good = gnss.rejected < NOTED_SHARE * of
-        what = "fixes" if word == "GNSS fixes" else "positions"
-        yield Check("good" if good else "care", what, f"{gnss.rejected:,} of {of:,} rejected", tuple(more))
+        good = gnss.rejected < NOTED_SHARE * count
+        measured = "fixes" if word == "GNSS fixes" else "positions"
+        yield Check("good" if good else "care", measured, f"{gnss.rejected:,} of {count:,} rejected", tuple(more))
     if jumps := jump_count(summary.reference_jumps):
         yield Check("care", "reference", jumps)
 

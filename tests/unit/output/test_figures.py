@@ -36,7 +36,7 @@ from icrtool.records.run import ICR_COLUMNS, Run
 from support.barn import configured, simulate
 
 BAD_FIXES = 4
-NAMES = [name for name, entry in FIGURES.items() if entry.of == "run"]
+NAMES = [name for name, entry in FIGURES.items() if entry.subject == "run"]
 ESTIMATE_KEY = [
     "estimate", "its ±1σ", "10 %", "90 %: converged", "no slip (±b/2, 0)", "no usable GNSS", "whole drive ±1σ"
 ]  # fmt: skip

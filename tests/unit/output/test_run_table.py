@@ -83,11 +83,11 @@ def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., R
 
 def test_turns_to_one_side_that_show_all_icrs_are_noted_with_the_other_side(make_run: Callable[..., Run]) -> None:
     run = make_run()
-    assert [one.grade for one in run_checks(run.document) if one.what == "excitation"] == ["good"]
+    assert [one.grade for one in run_checks(run.document) if one.name == "excitation"] == ["good"]
     excitation = run.summary["excitation"] | {"turned_right_deg": 29.0, "turned_left_deg": 904.0}
     excitation["verdict"] = dict.fromkeys(excitation["verdict"], "shown")
     checks = run_checks(with_summary(run, excitation=excitation).document)
-    ((grade, text),) = ((one.grade, one.text) for one in checks if one.what == "excitation")
+    ((grade, text),) = ((one.grade, one.text) for one in checks if one.name == "excitation")
     assert grade == "care"
     assert text.startswith("shown, but turned in one direction only: ")
     assert text.endswith("to the right")

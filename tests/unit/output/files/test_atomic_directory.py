@@ -16,14 +16,14 @@ from random import Random
 import pytest
 
 from icrtool.errors import OutputError
-from icrtool.output.files.atomic import Kind, atomic_directory, check_directory
+from icrtool.output.files.atomic import DirectoryKind, atomic_directory, check_directory
 
 
 def marked(directory: Path) -> bool:
     return (directory / "mark").exists()
 
 
-REPORT = Kind("report", marked, re.compile(r"mark|old/|sub/([0-9]\.gen)?|[0-9]\.gen"))
+REPORT = DirectoryKind("report", marked, re.compile(r"mark|old/|sub/([0-9]\.gen)?|[0-9]\.gen"))
 
 
 def write(directory: Path, text: str = "new") -> None:
@@ -206,8 +206,9 @@ KILLED = """
 import re, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[4])
-from icrtool.output.files.atomic import Kind, atomic_directory
-REPORT = Kind("report", lambda place: (place / "mark").exists(), re.compile(r"mark|[0-9].gen|sub/([0-9].gen)?"))
+from icrtool.output.files.atomic import DirectoryKind, atomic_directory
+NAMES = re.compile(r"mark|[0-9].gen|sub/([0-9].gen)?")
+REPORT = DirectoryKind("report", lambda place: (place / "mark").exists(), NAMES)
 if sys.argv[3] == "renames":
     sys.platform = "other"
 for number in range(int(sys.argv[2]), 1_000_000):

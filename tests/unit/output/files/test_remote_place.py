@@ -24,7 +24,7 @@ from icrtool.cli import main
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files import remote_place
 from icrtool.output.files.atomic import writer
-from icrtool.output.files.remote_place import on_disk
+from icrtool.output.files.remote_place import folder_on_disk
 from icrtool.records.places import UrlPath
 from support.batches import in_this_process
 from support.servers import SECRET, object_store
@@ -275,11 +275,11 @@ def test_a_batch_at_an_address_is_that_on_disk_and_is_continued(store, tmp_path,
 def test_names_in_a_bucket_lead_to_no_place_outside_the_temporary_folder(store, tmp_path):
     for name in ("one/../../../escaped.json", "one//etc/x.json", "one/a/", "one/b.json"):
         store.client.put_object(Bucket="field", Key=name, Body=b"{}")
-    with on_disk(UrlPath("s3://field/one")) as folder:
+    with folder_on_disk(UrlPath("s3://field/one")) as folder:
         found = [str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()]
         assert found == ["b.json"]
     store.client.put_object(Bucket="field", Key="one/b.json/c", Body=b"{}")
-    with pytest.raises(OutputError, match="cannot be written"), on_disk(UrlPath("s3://field/one")):
+    with pytest.raises(OutputError, match="cannot be written"), folder_on_disk(UrlPath("s3://field/one")):
         pass
     assert not list(tmp_path.rglob("escaped.json"))
 
