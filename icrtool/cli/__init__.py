@@ -26,7 +26,7 @@ from icrtool.records.process_resources import keep_freed, may_end, remove_unfini
 __all__ = ["main", "when_used"]
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""Signals that end a command; Windows has no SIGHUP."""
+"""Signals that end a command. Windows has no SIGHUP."""
 
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a program that Ctrl-C ended."""
@@ -35,7 +35,7 @@ SIGNAL_GRACE_S = 0.5
 """Time after a signal in which the main thread may end the process and the processes of a batch [s]."""
 
 OVER = 0
-"""Number that marks the end of the block, in the pipe from which the numbers of signals are read."""
+"""Number in the pipe of `end_at_once` that stands for the end of the block; all others are numbers of signals."""
 
 
 def main() -> None:
@@ -49,7 +49,7 @@ def main() -> None:
     # No figure is shown, and an invalid MPLBACKEND of the user would stop the import of matplotlib.
     os.environ["MPLBACKEND"] = "agg"
     if len(sys.argv) > 2:
-        # Called before the first thread starts. It takes some milliseconds, so a call for help alone leaves it out.
+        # This call must come before the first thread starts. It takes milliseconds, so a call for help leaves it out.
         keep_freed()
     # Few objects of a command form cycles. A garbage collection every 700 objects costs a tenth of the time of loading
     # numba and matplotlib, and of drawing. A command loads fewer objects than this threshold.
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def _run() -> int:
-    """Run the command that was called; return the exit status."""
+    """Run the command on the command line; return its exit status."""
     try:
         import click
 
@@ -93,11 +93,11 @@ def _run() -> int:
             print_error(f"{LogText(str(err.filename))}: {err.strerror}" if isinstance(err, OSError) else str(err))
             return 1
         except (MemoryError, ImportError, SystemError) as err:
-            # after a lack of memory, a library or a module may be loaded only in part
+            # After a lack of memory, a library or a module may be loaded only in part.
             if not (isinstance(err, MemoryError) or _memory_is_limited()):
                 raise
             advice = "give it more (ulimit -v), or read a part of the log (--from, --to)"
-            sys.stderr.write(f"Error: memory: there is not enough; {advice}\n")
+            sys.stderr.write(f"Error: memory: the process has reached its limit; {advice}\n")
             return 1
         except click.ClickException as err:
             err.show()
@@ -191,7 +191,7 @@ def _watch(arrived: int, over: threading.Event) -> None:
 def _end(number: int, frame: FrameType | None = None) -> None:
     """Remove the unfinished files of this process, and end the process, its threads and its worker processes."""
     if frame is not None and not may_end():
-        return  # `_watch` ends it
+        return  # The thread of `_watch` ends the process.
     # No import here, because the main thread may hold the import lock.
     if (processes := sys.modules.get("icrtool.fleet.processes")) is not None:
         processes.end_for_good()
@@ -209,7 +209,7 @@ class Stream:
 
     Attributes
     ----------
-    lost : why text was lost; empty where nothing was lost, and where the reader of a pipe closed it
+    lost : reason for which text was lost; empty if nothing was lost, or if the reader of a pipe closed it
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -243,6 +243,7 @@ class Stream:
             self._drop(err)
 
     def _drop(self, err: OSError) -> None:
+        """Keep the reason for an error of the stream, and drop all buffered text."""
         if err.errno != errno.EPIPE:
             self.lost = err.strerror or str(err)
         # Buffered text is dropped too, because the interpreter would fail with the same error at its end.

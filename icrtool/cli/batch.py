@@ -1,4 +1,4 @@
-"""``icrtool batch``."""
+"""``icrtool batch``, which fits and reports on many logs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from icrtool.records.requests import BatchRequest, LogRequest
 
 LONGEST_STAGE, LEAST_NAME = 28, 12
-"""Lengths in the live line [characters]: of the stage of a log with its separators, and at least of the log's name."""
+"""Longest stage of a log with its separators, and shortest name of a log, in the live line [characters]."""
 
 
 class Workers(NamedTuple):
@@ -47,11 +47,11 @@ class Workers(NamedTuple):
 WORKERS = options.options_as_record(
     "workers",
     Workers,
-    option("-j --jobs", "N", click.IntRange(min=1), "Logs at the same time; default: one per core, fewer where memory "
-           "is short."),
+    option("-j --jobs", "N", click.IntRange(min=1), "Number of logs at the same time; default: one per core, fewer if "
+           "memory is short."),
     option("--scheduler", "ADDRESS", None, "Process on a Dask cluster, for example tcp://host:8786."),
-    option("--worker-timeout worker_timeout_s", "SECONDS", POSITIVE, "Give up a cluster that has no scheduler or no "
-           "worker for so long.", default=60.0),
+    option("--worker-timeout worker_timeout_s", "SECONDS", POSITIVE, "Give up a cluster that has had no scheduler "
+           "or no worker for this time.", default=60.0),
 )  # fmt: skip
 
 
@@ -59,7 +59,7 @@ BATCH = options.options_as_record(
     "batch",
     f"{options.REQUESTS_MODULE}:BatchRequest",
     option("--timeout timeout_s", "SECONDS", POSITIVE, "Stop a log that takes longer.", default=1800.0),
-    flag("--redo", "Also process logs that are done."),
+    flag("--redo", "Process logs again that are done."),
     options.report_options(flag("--overwrite", "Also replace runs of other recordings.")),
     options.CONFIGURATION,
     options.INPUT_LIMITS,
@@ -76,7 +76,7 @@ BATCH = options.options_as_record(
 def batch_command(
     places: tuple[Path, ...], output: Path, workers: Workers, batch: BatchRequest, exports: Exports, printer: Printer
 ) -> None:
-    """Fit and report on many logs, in several processes, and collect a table with a row per log.
+    """Fit and report on many logs, in several processes, and write a table with a row per log.
 
     A FOLDER is searched recursively. A MANIFEST (CSV or TOML) lists logs or patterns with their robot, configuration,
     group and tags. A log that fails, hangs or ends its process does not affect the others. The same command continues
@@ -99,7 +99,7 @@ def batch_command(
         view = View(len(requests), printer)
         rows = run_all(requests, workers, batch, view, folder)
     missing = compared.missing(row.log for row in rows) if compared is not None else []
-    # Of an address once more: it has the runs now.
+    # The folder is fetched again, because an address now has the runs that the worker processes uploaded.
     with remote_place.folder_on_disk(output, parts=fleet_files.FOLDERS) as folder:
         calibrations = []
         if report_request.ladder:
@@ -131,13 +131,14 @@ def batch_command(
 def run_all(
     requests: Sequence[LogRequest], workers: Workers, batch: BatchRequest, view: View, folder: Path
 ) -> list[FleetLog]:
-    """Process all logs, and return the row of each log, in the order of the requests.
+    """Process all logs; return the row of each log, in the order of the requests.
 
     Parameters
     ----------
-    folder : folder on disk with the results; an address of the results is written from it
+    view : shows the stages and the rows while the batch runs
+    folder : folder on disk with the results, which are uploaded if the place of the results is an address
     """
-    # Imported at once, not at the first use: at a signal no module can be loaded any more.
+    # This import is not lazy, because no module can be loaded when a signal ends the process.
     from icrtool.fleet.processes import executor_of
 
     rows: list[FleetLog] = []
@@ -164,17 +165,17 @@ class View(LiveLine):
         self._counts: Counter[str] = Counter()
         self._processed = 0
         self._stages: dict[str, str] = {}
-        # Stages come from the threads of the logs. No thread may write between the removal of the line and a result.
+        # The threads of the logs report stages. No thread may write between the removal of the line and a result.
         self._lock = RLock()
 
     def stage(self, log: str, stage: str) -> None:
-        """Show the stage of a log."""
+        """Show that a log has begun a stage."""
         with self._lock:
             self._stages[log] = stage
             self._show()
 
     def row(self, row: FleetLog) -> None:
-        """Show the result of a log."""
+        """Print the result of a log."""
         with self._lock:
             self._stages.pop(row.log, None)
             self._counts[row.status] += 1
@@ -194,6 +195,7 @@ class View(LiveLine):
             self._show()
 
     def _show(self) -> None:
+        """Show on a terminal how many logs are done, rate and remaining time, and the stages of the running logs."""
         if not self.on_terminal:
             return
         done, worked = self._counts.total(), self._processed
@@ -216,7 +218,7 @@ class View(LiveLine):
 
 
 def line_of(row: FleetLog) -> str:
-    """Return the printed line about a log that could be used."""
+    """Return the line that is printed of a log that could be used."""
     is_cut = row.usable and "log_cut_off" in row.codes
     word = "skipped" if row.this_time == "skipped" else "cut off" if is_cut else row.status
     parts = [f"{word:7}", str(LogText(row.log))]

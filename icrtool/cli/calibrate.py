@@ -29,13 +29,21 @@ if TYPE_CHECKING:
     from icrtool.records.run import Run
 
 LARGEST_PLAN_BYTES = 50_000_000
+"""Largest size of the table of a planned path [bytes]."""
 
 
 @click.command("calibrate")
 @click.argument("sources", metavar="[GROUND=]LOG|RUN|FOLDER...", nargs=-1, required=True)
 @option("-o --output", "FILE|DIR", FILE, "Write the calibration file here.")
-@option("--x-icr", "METRES", float, "Forward position of the ICRs, where known: it gives that of the antenna. One log.")
-@option("--plot", "FILE", NEW_PICTURE, "Draw the residuals before and after the calibration: png, svg, pdf. One log.")
+@option(
+    "--x-icr",
+    "METRES",
+    float,
+    "Forward position of the ICRs [m], if you know it: the position of the antenna follows from it. One log only.",
+)
+@option(
+    "--plot", "FILE", NEW_PICTURE, "Draw the residuals before and after the calibration: png, svg, pdf. One log only."
+)
 @options.ALLOW_UNUSABLE
 @options.CONFIGURATION
 @options.INPUT_LIMITS
@@ -49,14 +57,15 @@ def calibrate_command(
     settings: ConfigSources,
     printer: Printer,
 ) -> None:
-    """Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.
+    """Calibrate the motion model of a robot from one log or many, and test it on data that it was not fitted to.
 
     Several logs are fitted together, and each is left out in turn to test the model. With one log, each trial is
-    predicted by a fit to the rest of the drive; position of the antenna, heading offset, delays and wheel scales are
-    estimated as well. A RUN keeps the configuration that it was fitted with. A FOLDER stands for
-    the runs in it, or else for its logs. Logs that are not usable, too short, copies or a part of another are left out.
-    With GROUND= before each, each ground is left out in turn too: a report with this calibration then answers how far
-    the robot gets on another ground. The folder of a batch, given alone, has the groups of its manifest as grounds.
+    predicted by a fit to the rest of the drive, and the position of the antenna, heading offset, delays and wheel
+    scales are estimated as well. A RUN keeps the configuration that it was fitted with. A FOLDER stands for the runs in
+    it, or for its logs if it has no runs. A log is left out if it is not usable, too short, a copy or a part of
+    another log. With GROUND= before each argument, each ground is left out in turn too: a report with this
+    calibration then states how far the robot gets on another ground. If the folder of a batch is the only argument,
+    the groups of its manifest are the grounds.
 
     \b
     Example:
@@ -72,7 +81,7 @@ def calibrate_command(
     if output is not None:
         formats.calibration_file(output)
     if plot is not None and run_directory.is_run_directory(places[0]):
-        # A run may come from a stranger, so no file or address that the run names is read.
+        # A stranger may have made the run, so no file or address that the run names is read.
         raise errors.RunError(places[0], "--plot draws the residuals of a log, not of a run", "name its log")
     if all(run_directory.is_run_directory(place) for place in places):
         check_run_config(config)
@@ -105,7 +114,7 @@ def calibrate_command(
 
 
 def _draw_residuals(source: Path, run: Run, plot: Path) -> None:
-    """Draw the residuals of one log's alignment."""
+    """Draw the residuals of the alignment of a log, which is read again, into the file `plot`."""
     log = read_log.read_log(source, run.config)
     measured = wheel_units.with_wheel_speeds(align.choose_reference(log, run.config), run.config)
     fit = corrections.align_streams(measured, run.config).fit
@@ -118,8 +127,8 @@ def _draw_residuals(source: Path, run: Run, plot: Path) -> None:
 @click.command("forecast")
 @option("--calibration calibration_file", "CAL.json|RUN", PLACE, "File that icrtool calibrate -o wrote, or a run, "
         "which is calibrated.", required=True)  # fmt: skip
-@option("--path", "PLAN.csv|RUN", PLACE, "Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven "
-        "again.", required=True)  # fmt: skip
+@option("--path", "PLAN.csv|RUN", PLACE, "Path to drive: a table with east_m, north_m[, speed_mps], or a run, "
+        "whose path is driven again.", required=True)  # fmt: skip
 @options.BUDGETS
 @option("-o --output", "FILE.csv", NEW_FILE, "Write a row for each metre.")
 @option("--plot", "FILE", NEW_PICTURE, "Draw the errors: png, svg, pdf.")
@@ -134,9 +143,9 @@ def forecast_command(
 ) -> None:
     """Forecast the error of driving a path without GNSS, with a calibrated motion model.
 
-    The expected and the 95 % error are given after each metre of the path: for wheels alone and, where the calibration
-    has a gyro, with it. They follow from the covariance of the calibration and from its error growth, which was
-    measured on held-out distance. A negative speed_mps in a plan drives in reverse.
+    The expected and the 95 % error are given after each metre of the path: for wheels alone and, if the calibration has
+    a gyro, with the gyro. They follow from the covariance of the calibration and from its error growth, which was
+    measured on held-out distance. With a negative speed_mps the robot drives in reverse.
 
     \b
     Example:
@@ -163,7 +172,10 @@ def forecast_command(
 def _forecasts(
     calibration: Calibration, path: Path, run: Run | None
 ) -> tuple[error_growth.Forecast, error_growth.Forecast | None]:
-    """Return forecasts along the path of a run or a table: by wheels alone and, if both have a gyro, with a gyro."""
+    """Return the forecasts along the path of a run, else of the table `path`: by wheels alone, and with a gyro.
+
+    The second forecast is None if the calibration or the run has no gyro.
+    """
     with_gyro = calibration.gyro is not None and calibration.gyro.error_sources is not None
     if run is not None:
         recording = pooled.turning_recording_of(run)

@@ -10,7 +10,7 @@ from icrtool import __version__
 from icrtool.records.text import did_you_mean
 
 _COMMANDS = {
-    "demo": "Fit a sample log of the package, and report on it: to see what icrtool gives.",
+    "demo": "Fit and report on a sample log that comes with icrtool, to see its results.",
     "info": "List what logs hold, which topics would be used, and the problems found.",
     "fit": "Learn the track ICRs of a robot from its logs.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
@@ -18,7 +18,7 @@ _COMMANDS = {
     "calibrate": "Calibrate the motion model of a robot from one log or many.",
     "forecast": "Forecast the error of driving a path without GNSS, with a calibration.",
     "export": "Write a calibration for a controller, or a run for evo, Google Earth, QGIS or Foxglove.",
-    "compare": "Compare groups of runs: ICRs, errors, and what the calibration of one costs on another.",
+    "compare": "Compare groups of runs: ICRs, errors, and the errors of the calibration of one group in another.",
     "batch": "Fit and report on folders of logs, in several processes; a table with a row per log.",
     "robots": "List the built-in robots, with their numbers and sources.",
     "config": "Print all configuration keys with their meaning, bounds and defaults, as a TOML file.",
@@ -27,13 +27,14 @@ _COMMANDS = {
     "simulate": "Drive a robot of known ICRs and record its log, with the truth next to it.",
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",
 }
+"""One line of help for each command, by its name."""
 
 _GROUPS = {
     "Start here": ("info", "report", "demo"),
     "Commands": ("fit", "dropout-report", "calibrate", "forecast", "export", "compare", "batch"),
     "More": ("robots", "config", "cache", "completion", "simulate", "study"),
 }
-"""The commands as ``--help`` groups them."""
+"""Titles of the groups in ``--help``, with the names of their commands."""
 
 _COMMAND_MODULES = {
     "info": "fit",
@@ -42,11 +43,11 @@ _COMMAND_MODULES = {
     "study": "simulate",
     **dict.fromkeys(("robots", "config", "cache", "completion"), "installation"),
 }
-"""Modules of the commands whose module has another name."""
+"""Names of the modules of commands whose module is not named after the command."""
 
 
 class _Commands(click.Group):
-    """Command group that finds each command in its module, as ``NAME_command``."""
+    """Command group that finds each command as ``NAME_command`` in its module."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)

@@ -1,4 +1,4 @@
-"""``icrtool demo``."""
+"""``icrtool demo``, which fits and reports on a sample log."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 import click
 
 SAMPLE_LOG, SAMPLE_ROBOT = "wheeled_lawnmower.mcap", "segway-rmp400"
-"""Log of the demonstration, and its robot: a rigid-body simulation of 200 s and 122 m."""
+"""Name of the sample log, a rigid-body simulation of 200 s and 122 m, and of its robot."""
 
 DEMO_RUN = Path("icrtool-runs", "demo")
-"""Run directory of the demonstration, below the current folder."""
+"""Run directory of the demonstration, relative to the current folder."""
 
 
 def sample_log() -> Path:
-    """Return the path of the sample log: of the installed package, or of the checkout that holds it."""
+    """Return the path of the sample log in the installed package, or in the checkout of the package."""
     package = Path(__file__).resolve().parents[1]
     folders = (package, package.parent)
     return next((at for folder in folders if (at := folder / "sample_logs" / SAMPLE_LOG).is_file()), Path(SAMPLE_LOG))
@@ -26,8 +26,8 @@ def sample_log() -> Path:
 def demo_command() -> None:
     """Fit a sample log that comes with icrtool, and report how far its robot drives without GNSS.
 
-    The two commands that do so are printed and run, as a user would run them; the result is the folder
-    icrtool-runs/demo, with a page to open in a browser. The log is a rigid-body simulation of a wheeled robot.
+    The command prints and runs the two commands that a user would run. The result is the folder icrtool-runs/demo,
+    with a page to open in a browser. The log is a rigid-body simulation of a wheeled robot.
     """
     fit = ["fit", str(sample_log()), "--robot", SAMPLE_ROBOT, "-o", str(DEMO_RUN)]
     report = ["dropout-report", str(DEMO_RUN)]

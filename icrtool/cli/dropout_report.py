@@ -1,4 +1,4 @@
-"""``icrtool dropout-report``."""
+"""``icrtool dropout-report``, which computes the open-loop errors of a run."""
 
 from __future__ import annotations
 
@@ -37,10 +37,11 @@ EPILOG_GATE = (
     'A limit of --gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "recommended.p95@10m <= 1.2"'
     ', or "MODEL.within@ERRORm >= METRES", for example "recommended.within@0.5m >= 10".'
 )
+"""Text below the help of the command."""
 
 
 def read_horizons(text: str) -> tuple[float, ...]:
-    """Return the distances [m] in the value of ``--horizons``."""
+    """Return the distances [m] in the value of ``--horizons``; refuse a distance that is not above zero."""
     metres = options.numbers_reader("M,M,...")(text)
     if min(metres) <= 0:
         raise click.BadParameter(f"{text!r} has a distance that is not above zero")
@@ -49,21 +50,21 @@ def read_horizons(text: str) -> tuple[float, ...]:
 
 REPORT_OPTIONS = options.report_options(
     options.PLACES,
-    option("--horizons horizons_m", "M,M,...", read_horizons, "Distances without GNSS [m], in place of the configured "
-           "ones."),
-    option("--score", "TOPIC", None, "Also compare the poses of a topic with the reference, for example "
-           "/odometry/filtered; needs the LOG, which is read again; repeatable.", multiple=True),
+    option("--horizons horizons_m", "M,M,...", read_horizons, "Distances without GNSS [m]; default: from the "
+           "configuration."),
+    option("--score", "TOPIC", None, "Also compare the poses of a topic of the LOG with the reference, for example "
+           "/odometry/filtered; the LOG is read again; repeatable.", multiple=True),
     option("--outage outage_s", "SECONDS", POSITIVE, "Force GNSS outages of this length, and report the error at their "
            "end; repeatable.", multiple=True),
-    option("--outage-at outage_at_s", "SECONDS", float, "Begin of a forced outage, since the first state; default: "
-           "equal spacing; repeatable.", multiple=True),
+    option("--outage-at outage_at_s", "SECONDS", float, "Begin of a forced outage, in seconds since the first "
+           "state; default: evenly spaced; repeatable.", multiple=True),
     choice("--reference", get_args(Reference), "Compare trials with the states of the filter, or of the smoother "
            "(fit --smooth).", default="filter"),
-    flag("--without-events", "Leave out trials that cross a slip event, and report how much they change the errors."),
-    flag("--with-jumps", "Count trials that cross a jump of the reference too."),
-    choice("--starts", get_args(Starts), "moving: each standstill is one start; all: every recorded state is one.",
+    flag("--without-events", "Leave out trials that cross a slip event; report how much they change the errors."),
+    flag("--with-jumps", "Also count trials that cross a jump of the reference."),
+    choice("--starts", get_args(Starts), "moving: each standstill is one start; all: every recorded state is a start.",
            default="moving"),
-    flag("--trials", "Write every single trial to trials.parquet."),
+    flag("--trials", "Write every trial to trials.parquet."),
     option("--seed", None, click.IntRange(min=0), "Seed of the random draws."),
 )  # fmt: skip
 
@@ -78,10 +79,10 @@ def dropout_report_command(
     sources: tuple[Path, ...], place: ResultPlace, calibrations: tuple[Path, ...], report: ReportRequest,
     files: ResultFiles, baseline: Path | None, exports: Exports, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
-    """Report how far off a robot is without GNSS: open loop from every recorded state, over 1 to 20 m.
+    """Report the position errors of a robot without GNSS: open loop from every recorded state, over 1 to 20 m.
 
-    RUN is a directory that `icrtool fit` wrote, or its address; a LOG is fitted first. Without an argument: the newest
-    run below icrtool-runs/. The report is written into the run directory, as dropout/.
+    RUN is a directory that `icrtool fit` wrote, or its address; a LOG is fitted first. Without an argument, the newest
+    run below icrtool-runs/ is used. The report is written to dropout/ in the run directory.
 
     \b
     Example:
@@ -100,7 +101,7 @@ def dropout_report_command(
         why = f"{escaped(str(runs[0]))} is a run, which holds no poses of other topics"
         raise errors.ConfigError("--score", why, "name its LOG in place of the run")
     if report.score and recording_files.STANDARD_INPUT in sources:
-        raise errors.ConfigError("--score", "the log is read twice, and standard input is there once", "name a file")
+        raise errors.ConfigError("--score", "the log is read twice, and standard input can be read once", "name a file")
     if compared is not None and len(places) == len(sources) and any(map(options.names_baseline, report.gates)):
         robot = config.robot.name or ""
         compared.check_compares((recording_files.log_name(log), content_of(log), robot, "") for log in sources)
@@ -129,10 +130,17 @@ def dropout_report_command(
 def plan_sources(
     sources: tuple[Path, ...], place: ResultPlace, config: Config, printer: Printer
 ) -> tuple[tuple[Path, ...], dict[Path, Place]]:
-    """Return the sources (the newest run if the user names none), and the run directory of each source that is a log.
+    """Return the sources, and the run directory of each source that is a log.
 
-    Requests that can be refused without reading a log are refused here, for example settings for a finished run, which
-    keeps its configuration and its place.
+    If the user names no source, the newest run is the source. A request that can be refused before a log is read is
+    refused here: a finished run keeps its configuration and its place.
+
+    Raises
+    ------
+    ConfigError
+        Settings or a place are given for finished runs.
+    RunError
+        There is no run.
     """
     sources = logs_of(sources or (run_directory.newest_run(RUNS_FOLDER),), printer)
     logs = tuple(
@@ -150,14 +158,14 @@ def plan_sources(
 
 
 def content_of(log: Path) -> tuple[str, ...]:
-    """Return the SHA-256 of each file of a log on disk, by which a baseline finds the log."""
+    """Return the SHA-256 of each file of a log on disk, by which a baseline finds the log; empty for an address."""
     if isinstance(log, UrlPath):
         return ()
     return tuple(recording_files.file_sha256(file) for file in recording_files.files_of_log(log) if file.is_file())
 
 
 class OtherResults(NamedTuple):
-    """Results that a report is compared with: calibrations, and the reports of an earlier version."""
+    """Results that a report is compared with: calibrations, and earlier reports."""
 
     calibrations: tuple[Calibration, ...]
     baseline: Baseline | None
@@ -167,13 +175,20 @@ def report_one(
     source: Path, place: Place | None, config: Config, request: ReportRequest, files: ResultFiles,
     other_results: OtherResults, printer: Printer,
 ) -> DropoutReport:  # fmt: skip
-    """Return the report on one source; `place` is the run directory of a log, None for a run."""
+    """Write, print and return the report on one source.
+
+    Parameters
+    ----------
+    source : a run or a log
+    place : run directory of a log, which is fitted first; None for a run
+    """
     with ExitStack() as stack:
         if place is None:
             folder = stack.enter_context(remote_place.folder_on_disk(source, needed=bool))
             run = run_directory.open_run(folder, whole=False)
         else:
-            # Run and report are one result: if the report fails, an older run in this place stays, with its report.
+            # Run and report are one result: if the report fails, an older run in this place stays there with its
+            # report.
             run, folder = stack.enter_context(fitted_log(source, place, config, request.fit, files, printer))
         if request.outage_at_s and not dropout_report.forced_lengths_s(run, request):
             raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")

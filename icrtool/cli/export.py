@@ -1,4 +1,4 @@
-"""``icrtool export``."""
+"""``icrtool export``, which writes results for other programs."""
 
 from __future__ import annotations
 
@@ -30,9 +30,11 @@ if TYPE_CHECKING:
 CONTROLLERS, TRAJECTORIES = get_args(ControllerTarget), get_args(TrajectoryFormat)
 LOCALIZATION = "robot_localization"
 EXPORT_TARGETS = (*CONTROLLERS, LOCALIZATION, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
+"""Values of --for: the programs that results are exported for."""
 
 TEXT_SUFFIXES = (".txt", ".csv")
-"""Suffixes of a file with one trajectory, in addition to the names of formats. Other suffixes belong to the name."""
+"""Suffixes of a file with one trajectory, in addition to the suffixes of the formats. A path with any other suffix is a
+folder."""
 
 _EXAMPLE_COMMANDS = (
     ("a controller", "diff_drive_controller", "clearpath, nav2, husarion", False),
@@ -42,33 +44,36 @@ _EXAMPLE_COMMANDS = (
     ("a map", "qgis -o map.geojson", "google-earth", True),
     ("a viewer", "foxglove -o view.mcap", "", True),
 )
-"""Programs that need an export: name, target with options, further targets, and whether paths of a run are needed."""
+"""Uses of an export: words for the use, target with options, further targets, and whether the target needs a run."""
 
-ALL_THE_SAME = "--force exports it all the same"
+FORCE_ADVICE = "--force exports it nevertheless"
+"""Advice in errors about results that are not fit for use."""
 
 
 @click.command("export")
 @click.argument("source", metavar="[RUN|CAL.json]", required=False, type=PLACE)
-@choice("--for target", EXPORT_TARGETS, "What the result is for; without it, the commands are listed.")
-@option("-o --output", "FILE", FILE, "File to write; for evo and kitti a directory with a file for each path of the "
+@choice("--for target", EXPORT_TARGETS, "Program that the result is for; without it, example commands are listed.")
+@option("-o --output", "FILE", FILE, "File to write; for evo and kitti: a folder for a file of each path of the "
         "run, or a file with the suffix .tum, .kitti, .txt or .csv.")  # fmt: skip
-@flag("--force", "Also export what is not fit for use.")
+@flag("--force", "Also export a result that is not fit for use.")
 def export_command(source: Path | None, target: str | None, output: Path | None, force: bool) -> None:
-    """Print a calibration for a robot's controller, or a run for other programs.
+    """Print a calibration for a controller, or a run for other programs.
 
-    CAL.json is a file that `icrtool calibrate -o` wrote. A RUN, a directory that `icrtool fit` wrote, is calibrated
-    first, with the same result; without an argument, the newest run below icrtool-runs/. The covariances are measured
-    on distance held out of the fit. Target icr: the whole motion model as JSON, in REP-103 (y left).
+    CAL.json is a file that `icrtool calibrate -o` wrote. A RUN is a directory that `icrtool fit` wrote; it is
+    calibrated first, with the same result. Without an argument, the newest run below icrtool-runs/ is used. The
+    covariances are measured on distance held out of the fit. Target icr writes the whole motion model as JSON, in
+    REP-103 (y left).
 
-    Target robot_localization: ekf.yaml with parameters of its filter and of navsat_transform_node, and covariances of
-    wheel odometry and IMU, with source and standard deviation of each; of a CAL.json only the covariances.
+    Target robot_localization writes ekf.yaml: parameters of the filter and of navsat_transform_node, and covariances
+    of wheel odometry and IMU, each with its source and standard deviation. For a CAL.json it writes the covariances
+    alone.
 
     \b
     Paths of a RUN (world ENU about the datum, body x forward and y left):
-      evo, kitti    trajectories in TUM or KITTI format: FILE is the filter's; DIR also gets icr and no_slip
+      evo, kitti    trajectories in TUM or KITTI format: FILE of the filter; DIR also of icr and no_slip
       google-earth  KML: paths, drive over time, outages, slip events
-      qgis          GeoJSON: the same, and states and fixes with attributes
-      foxglove      MCAP: odometry, fixes, ICRs, open-loop error, events; the layout is next to it
+      qgis          GeoJSON: the same as KML, and states and fixes with attributes
+      foxglove      MCAP: odometry, fixes, ICRs, open-loop error, events; and a layout file
 
     \b
     Example:
@@ -88,9 +93,9 @@ def export_command(source: Path | None, target: str | None, output: Path | None,
     if output is not None:
         atomic.check_place(output)
     if target in CONTROLLERS or target == LOCALIZATION:
-        name, calibration, run = read_calibration_and_run(source, force=force, advice=f"; {ALL_THE_SAME}")
+        name, calibration, run = read_calibration_and_run(source, force=force, advice=f"; {FORCE_ADVICE}")
         if (reasons := record.unfit_reasons(calibration)) and not force:
-            advice = f"calibrate with other logs; {ALL_THE_SAME}"
+            advice = f"calibrate with other logs; {FORCE_ADVICE}"
             raise errors.DataError(name, f"not fit for use: {reasons[0].text}", advice)
         if target == LOCALIZATION:
             text = localization_file.format_localization(calibration, localization.localization(calibration, run))
@@ -109,28 +114,28 @@ def export_command(source: Path | None, target: str | None, output: Path | None,
 
 
 def _checked_target(target: str | None, source: Path | None, output: Path | None) -> str:
-    """Return the target; refuse a command without a target, and a binary target without an output file."""
+    """Return the target; refuse a missing target, and a binary target without an output file."""
     if target is None:
         raise click.UsageError(_example_commands(source))
     if target == "foxglove" and output is None:
-        raise click.UsageError("an MCAP file is not text: name it with -o FILE.mcap")
+        raise click.UsageError("an MCAP file cannot be printed: name a file with -o FILE.mcap")
     return target
 
 
 def _example_commands(source: Path | None) -> str:
-    """Return an example command for each kind of program; without programs that need paths for a calibration."""
+    """Return an example command for each use of an export; for a calibration, only uses that need no run."""
     name = "RUN" if source is None else shlex.quote(escaped(str(source)))
-    of_run = source is None or source.is_dir()
+    has_paths = source is None or source.is_dir()
     lines = [
         f"  {user:15} icrtool export --for {first} {name}{f'   # also {others}' if others else ''}"
         for user, first, others, paths_only in _EXAMPLE_COMMANDS
-        if of_run or not paths_only
+        if has_paths or not paths_only
     ]
     return "\n".join(["--for is missing: what is the export for?", *lines])
 
 
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
-    """Write a file for each path of a run."""
+    """Write a file for each path of a run into a folder, and print the names of the files."""
     directory.mkdir(parents=True, exist_ok=True)
     files = {Below(directory, f"{path.name}{paths.SUFFIXES[target]}"): path for path in paths.paths_of(run)}
     for file in files:
@@ -141,7 +146,7 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
 
 
 def _write_foxglove(run: Run, output: Path) -> None:
-    """Write the MCAP file, and the layout next to it."""
+    """Write the MCAP file of a run, and the layout into the same folder; print both names."""
     layout = Below(output.parent, f"{output.stem}.layout.json")
     atomic.check_place(layout, foxglove.is_layout)
     with atomic.atomic_file(output) as partial:

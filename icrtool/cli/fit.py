@@ -41,14 +41,15 @@ REQUEST = options.options_as_record("request", f"{options.REQUESTS_MODULE}:FitRe
     "files",
     f"{options.REQUESTS_MODULE}:ResultFiles",
     options.PLACES,
-    choice("--states", get_args(StatesFormat), "Format of the states; default: csv, parquet for over a million "
-           "states."),
+    choice("--states", get_args(StatesFormat), "Format of the states; default: csv, but parquet for more than a "
+           "million states."),
     options.PLOTS_OPTION,
     options.FIGURES_OPTION,
-    option("--warm-start", "RUN|CAL.json", PLACE, "Start from another run's final ICRs and covariance, or from those "
-           "of a calibration."),
+    option("--warm-start", "RUN|CAL.json", PLACE, "Start from the final ICRs and covariance of another run, or from a "
+           "calibration."),
     option("--terrain-change changes_s", "T", lambda text: options.numbers_reader("T, finite seconds", 1)(text)[0],
-           "The ground changes after T seconds: inflate the ICR covariance there; repeatable.", multiple=True),
+           "The ground changes T seconds after the first state: inflate the ICR covariance there; repeatable.",
+           multiple=True),
     flag("--smooth", "Also write the RTS smoother's states (smoothed.csv)."),
     options.CUT,
 ))  # fmt: skip
@@ -67,8 +68,8 @@ def fit_command(
 ) -> None:  # fmt: skip
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
-    Without options the topics are found by type and content. --robot or --set robot.track_width_m=… and
-    robot.wheel_radius_m=… give what the messages do not hold.
+    Without options, topics are found by type and content. --robot, or --set robot.track_width_m=… and
+    robot.wheel_radius_m=…, gives the numbers of the robot, which the messages do not hold.
 
     \b
     Example:
@@ -87,7 +88,7 @@ def fit_command(
                 print_error(f"{run.name}: do not use this run: {run.document.unusable_because}")
             where = escaped(str(path_of(run_place)))
             document |= {"directory": where, "run": run.summary}
-            # The next command reports the problems of the log.
+            # For an unusable run, this is the next command: it reports the problems of the log.
             examine = shlex.join(
                 ["icrtool", "info", escaped(str(log)), "-v", *options.options_to_repeat(settings, request)]
             )
@@ -102,9 +103,10 @@ def fitted_log(
     log: Path, place: Place, config: Config, request: FitRequest, files: ResultFiles, printer: Printer,
     warm_start: Path | None = None, *, warns: bool = True,
 ) -> Iterator[tuple[Run, Path]]:  # fmt: skip
-    """Fit a log, and yield the run and its directory; with `warns`, print warnings and streams on standard error.
+    """Fit a log, and yield the run and its directory on disk; with `warns`, print warnings and streams afterwards.
 
-    A run with other settings is replaced only if `files.overwrite` is set.
+    Files that the block writes into the directory belong to the run. A run that was made with other settings is
+    replaced only if `files.overwrite` is set.
     """
     if not (files.overwrite or isinstance(path_of(place), UrlPath)):
         run_directory.check_target(place, log)
@@ -139,12 +141,12 @@ def fitted_log(
 @options.INPUT_LIMITS
 @options.printer_options(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSources, printer: Printer) -> None:
-    """List what each log holds, which topics are used for wheels, position and heading, and the problems found.
+    """List the content of each log, the topics that are used for wheels, position and heading, and the problems found.
 
-    The filter runs too, but nothing is written. The report names the ICRs that the drive shows and, where
-    one is not shown, what to drive next.
+    The filter runs too, but no file is written. The output names the ICRs that the drive shows and, if an ICR is not
+    shown, what to drive next.
 
-    Exit status 1 when `icrtool fit` could not run on a log.
+    Exit status: 1 if `icrtool fit` could not run on a log.
     """
     config, options_given = settings.load(), options.options_to_repeat(settings, request)
     inputs = Inputs("log")
@@ -158,10 +160,14 @@ def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSo
 def _examine(
     log: Path, config: Config, request: FitRequest, options_given: list[str], document: dict[str, Any], printer: Printer
 ) -> None:
-    """Read and fit a log, and print whether it can be fitted, its content, and the command to run next.
+    """Read and fit a log; print whether it can be fitted, its content, and the command to run next.
 
     The filter runs, because only its result shows which ICRs the drive determines and which sensors disagree.
-    `document` gets the printed content as plain data, with ``run`` as in run.json, null if the log cannot be fitted.
+
+    Parameters
+    ----------
+    options_given : options of this call that the next command needs too
+    document : gets the content as plain data for --json; ``run`` is as in run.json, null if the log cannot be fitted
 
     Raises
     ------
@@ -182,7 +188,7 @@ def _examine(
     except errors.IcrToolError as err:
         problem = err
     holds = read_log.survey_document(survey) if survey is not None else None
-    # Beginnings of errors and warnings about the log: its name, or its path.
+    # Errors and warnings about the log begin with its name or its path.
     names = (survey.name if survey is not None else LogText(log.stem), escaped(str(log)))
     command = overview.next_command(escaped(str(log)), options_given, run)
     used = [stream.topic for stream in measured.streams if stream.role == "gnss"] if measured is not None else []

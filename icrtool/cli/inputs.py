@@ -31,17 +31,18 @@ if TYPE_CHECKING:
     from icrtool.records.run import Run
 
 RUNS_FOLDER = Path("icrtool-runs")
+"""Folder of the run directories, relative to the current folder."""
 
 
 def logs_of(places: tuple[Path, ...], printer: Printer) -> tuple[Path, ...]:
-    """Return the logs among the arguments of a command, also in folders, and warn of files that are no logs."""
+    """Return the logs among the arguments of a command and in folders among them; warn of files that are no logs."""
     logs, others = recordings.logs_among(places)
-    printer.warn(f"{escaped(str(file))}: not a log: left out" for file in others)
+    printer.warn(f"{escaped(str(file))}: is not a log; it is left out" for file in others)
     return tuple(logs)
 
 
 def runs_or_logs(place: Path) -> list[Path]:
-    """Return the runs in a folder, or its logs if it has no runs; a run or a log is returned itself."""
+    """Return the runs in a folder, or its logs if it has no runs; for a run or a log, return the place itself."""
     if not isinstance(place, UrlPath):
         if run_directory.is_run_directory(place) or not place.is_dir():
             return [place]
@@ -54,7 +55,7 @@ def runs_or_logs(place: Path) -> list[Path]:
 
 
 def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run]:
-    """Return runs, read from their directories or made of logs without a recommended model; nothing is written."""
+    """Return the runs of run directories and of logs. A log is fitted without a motion model; no file is written."""
     runs = []
     with printer.progress("reading") as progress:
         for path in paths:
@@ -68,14 +69,14 @@ def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[
 
 
 def check_run_config(config: Config, *, free: str = "") -> None:
-    """Refuse settings for a finished run; a report may change settings of the section `free`."""
+    """Refuse configured settings for a finished run, except settings of the section `free`."""
     if sections := sorted({key.partition(".")[0] for key in config.given} - {free}):
-        advice = "fit the log again with it, or name the log in place of its run"
-        raise errors.ConfigError(f"[{sections[0]}]", "a finished run keeps the configuration it was made with", advice)
+        advice = "fit the log again with these settings, or name the log in place of its run"
+        raise errors.ConfigError(f"[{sections[0]}]", "a finished run keeps its own configuration", advice)
 
 
 def is_log(source: Path) -> bool:
-    """Return whether an argument is read as a log: a file that is not JSON, a bag directory, or an address."""
+    """Return whether an argument is read as a log: a file but JSON, a bag directory, or an address without a run."""
     if isinstance(source, UrlPath):
         return not run_directory.is_run_directory(source)
     if source.is_file():
@@ -85,20 +86,26 @@ def is_log(source: Path) -> bool:
 
 
 class ResultPlace(NamedTuple):
-    """Where the runs of a command go, by -o and --into."""
+    """Values of -o and --into: the run directory of one log, and the folder of run directories."""
 
     output: Path | None = None
     into: Path | None = None
 
 
 def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[Place]:
-    """Return the run directory of each log: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` in `into`.
+    """Return the run directory of each log.
 
-    ``DIR/NAME`` is also used for several logs. Logs of equal names get names from the differing parts of their paths.
+    It is ``icrtool-runs/NAME`` by default, `output` for one log, ``OUTPUT/NAME`` for several logs, and ``INTO/NAME``
+    for any number of logs. Logs of equal names get names from the differing parts of their paths.
+
+    Raises
+    ------
+    OutputError
+        The folder of the run directories is a run itself.
     """
     output, into = place
     if output is not None and into is not None:
-        raise click.UsageError("-o and --into both state where the runs go: give one of them")
+        raise click.UsageError("-o and --into exclude each other: give one of them")
     if output is not None and len(logs) == 1:
         return [output]
     parent = output or into
@@ -110,14 +117,28 @@ def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[Place]:
 
 
 def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:
-    """Return a calibration and its name: the content of a calibration file, or the calibration of a run."""
+    """Return the name of a calibration file or run, and its calibration (see `read_calibration_and_run`)."""
     return read_calibration_and_run(source, force=force, advice=advice)[:2]
 
 
 def read_calibration_and_run(
     source: Path | None, *, force: bool = False, advice: str = ""
 ) -> tuple[str, Calibration, Run | None]:
-    """Return a calibration, its name, and the run that was calibrated; None for a calibration file."""
+    """Return the name of a calibration file or run, its calibration, and the run; None for a calibration file.
+
+    Parameters
+    ----------
+    source : place of the file or run; None: the newest run
+    force : also calibrate a run that is not usable
+    advice : text at the end of the error about such a run
+
+    Raises
+    ------
+    DataError
+        The run is not usable, or too short.
+    RunError
+        There is no such file or run, or it is a log.
+    """
     if source is not None and source.suffix == ".json" and not source.exists() and not isinstance(source, UrlPath):
         raise errors.RunError(source, "no such file", "icrtool calibrate -o makes a calibration file")
     if source is not None and is_log(source):
@@ -133,7 +154,7 @@ def read_calibration_and_run(
 
 
 def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
-    """Return the places of each group by name; a single argument may be the folder of a batch, which has groups.
+    """Return the places of each group by name; the folder of a batch, as the only argument, has its own groups.
 
     Raises
     ------
@@ -150,12 +171,12 @@ def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
         else:
             places.setdefault(name, []).extend(_expanded(path))
     if len(places) < 2:
-        raise errors.ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
+        raise errors.ConfigError("compare", "only one group is given", "name two or more: old=season1/ new=season2/")
     return places
 
 
 def _expanded(place: Path) -> list[Path]:
-    """Return the files that a pattern after ``NAME=`` matches, which no shell expands; else the place itself."""
+    """Return the files that a pattern after ``NAME=`` matches, because no shell expands it; else the place itself."""
     if isinstance(place, UrlPath) or place.exists() or not glob.has_magic(str(place)):
         return [place]
     files = sorted(glob.glob(str(place)))  # noqa: PTH207 - a pattern may be absolute
@@ -163,7 +184,7 @@ def _expanded(place: Path) -> list[Path]:
 
 
 def named_place(source: str) -> tuple[LogText, Path]:
-    """Return the name of the group and the place in one argument of ``compare``."""
+    """Return the name of the group and the place in an argument ``NAME=PLACE`` or ``PLACE``."""
     whole = place_of(source)
     name, sign, place = source.partition("=")
     # An address may have an equals sign in its query.
@@ -173,14 +194,14 @@ def named_place(source: str) -> tuple[LogText, Path]:
 
 
 def grounds_of(sources: tuple[str, ...]) -> tuple[list[Path], list[str]]:
-    """Return the runs and logs of ``calibrate``, and the name of the ground of each; no names if the user gives none.
+    """Return the runs and logs of ``calibrate``, and the ground of each; no grounds if the user names none.
 
-    A single argument may be the folder of a batch, whose groups are the grounds.
+    If the folder of a batch is the only argument, its groups are the grounds.
 
     Raises
     ------
     ConfigError
-        Some arguments have the name of a ground and others have not.
+        Only some of the arguments name a ground.
     RunError
         The table of the batch cannot be read.
     """
@@ -191,7 +212,7 @@ def grounds_of(sources: tuple[str, ...]) -> tuple[list[Path], list[str]]:
         return [run for _, run in of_grounds], [str(name) for name, _ in of_grounds]
     if any(have_ground) and not all(have_ground):
         without = escaped(str(places[have_ground.index(False)][1]))
-        raise errors.ConfigError(without, "has no name of a ground", "write NAME= before each argument, or before none")
+        raise errors.ConfigError(without, "names no ground", "write GROUND= before each argument, or before none")
     of_grounds = [
         (str(name), run_or_log)
         for name, place in places

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 def robots_command(printer: Printer) -> None:
     """List the built-in robots for --robot, with their numbers and sources.
 
-    For another robot, give --set robot.track_width_m=… and --set robot.wheel_radius_m=…, or a file: icrtool config
-    prints one to fill in.
+    For another robot, give --set robot.track_width_m=… and --set robot.wheel_radius_m=…, or a configuration file, which
+    icrtool config prints.
     """
     robots = config.builtin_robots()
     keys = ("track_width_m", "wheel_radius_m", "encoder_counts_per_rev", "skid_factor", "source")
@@ -55,10 +55,10 @@ def robots_command(printer: Printer) -> None:
 @options.CONFIGURATION
 @option("-o --output", "FILE", options.NEW_FILE, "File to write; default: standard output.")
 def config_command(settings: ConfigSources, output: Path | None) -> None:
-    """Print all configuration keys as a TOML file: meaning, type and bounds, and value.
+    """Print all configuration keys as a TOML file, with meaning, type, bounds and value.
 
-    Without options these are the defaults; --robot, --config and --set change them. Keys without default stand in
-    comments, with an example. Edit the result, and use it with --config.
+    Without options the values are the defaults; --robot, --config and --set change them. Keys without a default are
+    comments with an example. Edit the file, and use it with --config.
 
     \b
     Example:
@@ -70,17 +70,17 @@ def config_command(settings: ConfigSources, output: Path | None) -> None:
 
 @click.group("cache")
 def cache_command() -> None:
-    """Machine code of the compiled kernels, which the first commands on a computer otherwise wait for."""
+    """Manage the machine code of the kernels, which the first commands on a computer otherwise compile."""
 
 
 @cache_command.command("warm")
 @flag("-q --quiet", "Print no result.")
 def compile_all(*, quiet: bool) -> None:
-    """Compile all kernels and modules now, so that no later command waits for it: for an image or a CI cache.
+    """Compile all kernels and modules now, so that no later command has to: for an image or a CI cache.
 
-    The kernels' code is kept in NUMBA_CACHE_DIR; without it, next to the installed package, or else in the user's
-    cache. From a NUMBA_CACHE_DIR that can only be read it is used too. With NUMBA_CPU_NAME=generic, here and in later
-    commands, it runs on any processor of this architecture.
+    The machine code is kept in NUMBA_CACHE_DIR, else in the installed package, else in the user's cache. Later commands
+    also use it from a NUMBA_CACHE_DIR that they cannot write. If NUMBA_CPU_NAME=generic is set here and in later
+    commands, the code runs on any processor of this architecture.
 
     \b
     Example:
@@ -93,11 +93,13 @@ def compile_all(*, quiet: bool) -> None:
 
     begin = time.perf_counter()
     for module in pkgutil.walk_packages(icrtool.__path__, "icrtool."):
-        # Python keeps the compiled code of an imported module
+        # Python keeps the compiled code of an imported module.
         importlib.import_module(module.name)
     place = writable_place()
     if place is None:
-        raise OutputError(cache_places()[0], "cannot be written", "set NUMBA_CACHE_DIR to a directory that can")
+        raise OutputError(
+            cache_places()[0], "cannot be written", "set NUMBA_CACHE_DIR to a directory that can be written"
+        )
     call_all_kernels()
     if not quiet:
         compiled = [bool(kernel.compiled) for kernel in all_kernels()]
@@ -108,7 +110,7 @@ def compile_all(*, quiet: bool) -> None:
 
 
 def call_all_kernels() -> None:
-    """Call each kernel with the types of arguments that the commands use: drive a robot, fit, smooth, report, study."""
+    """Call each kernel with the types of arguments of the commands: simulate, fit, smooth, report and study a robot."""
     import numpy as np
 
     import icrtool
@@ -147,12 +149,12 @@ NO_BLANK_AFTER_EQUALS = """\
 
 
 class BashWithEquals(BashComplete):
-    """Completion of ``--set key=value`` in bash, which ends a word at ``=`` and replaces only the text after it."""
+    """Completion of ``--set key=value`` in bash, which splits words at ``=`` and replaces only the text after it."""
 
     source_template = BashComplete.source_template.replace("    return 0\n", NO_BLANK_AFTER_EQUALS, 1)
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Return the words before the incomplete word, and this word; words that bash cut at ``=`` are joined."""
+        """Return the complete words and the incomplete word; words that bash split at ``=`` are joined."""
         args, incomplete = super().get_completion_args()
         rest, words = [*args, incomplete], [""]
         while rest:
@@ -166,14 +168,14 @@ class BashWithEquals(BashComplete):
         return words[1:-1], words[-1]
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return a completion without the text up to its ``=``."""
+        """Return a completion without the text before its ``=``."""
         key, equals, value = item.value.partition("=")
         after = value if equals and value else f"{key}{equals}"
         return f"{item.type},{after}"
 
 
 def register_completion() -> None:
-    """Register `BashWithEquals` in click. It is called before click answers a shell that asks for completions."""
+    """Register `BashWithEquals` in click, before click answers a shell that asks for completions."""
     add_completion_class(BashWithEquals, "bash")
 
 
@@ -193,5 +195,5 @@ def completion_command(shell: str) -> None:
     register_completion()
     kind = get_completion_class(shell)
     if kind is None:
-        raise click.UsageError(f"click knows no completion for {shell}")
+        raise click.UsageError(f"click has no completion for {shell}")
     click.echo(kind(icrtool, {}, "icrtool", "_ICRTOOL_COMPLETE").source())

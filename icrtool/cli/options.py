@@ -49,14 +49,14 @@ Record = TypeVar("Record")
 Change = Callable[[Record], Record]
 
 REQUESTS_MODULE = "icrtool.records.requests"
-"""Module of the records that are made from options; it is imported when a command is called."""
+"""Name of the module of the records that are made from options. It is imported when a command is called."""
 
 
 class _Positive(click.FloatRange):
-    """Type of a number above zero. A text with a unit is refused, with the number to type in the message."""
+    """Type of a number above zero. It refuses a text with a unit; the error states the number to type."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401 - as click has it
-        """Return the number; the error for another text states the number to type."""
+        """Return the number in a text; the error for a text with a unit states the number to type."""
         with_unit = re.fullmatch(r"\s*(\d*\.?\d+)\s*([a-zA-Zµ]+)\s*", value) if isinstance(value, str) else None
         if with_unit is None or with_unit[2].lower() in ("inf", "nan", "e"):
             return super().convert(value, param, ctx)
@@ -67,7 +67,7 @@ class _Positive(click.FloatRange):
 
 
 METRES_OF_UNIT = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
-"""Units of length that a user may type, in metres."""
+"""Metres in each unit of length that a user may type."""
 
 POSITIVE = _Positive(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
@@ -77,14 +77,15 @@ USUAL_OPTIONS = (
     "output", "robot", "config", "set", "topics", "path", "duration", "speed", "seed", "runs", "jobs", "budget",
     "calibration", "gate", "baseline", "outage", "plots", "overwrite", "strict", "json", "quiet", "verbose", "help",
 )  # fmt: skip
-"""Names of the options that most calls need, in the order in which the help lists them."""
+"""Names of the options that most calls need, in the order in which the help lists them. Other options come after
+them."""
 
 
 class GroupedCommand(click.Command):
-    """Command whose help lists the usual options first, and the other options under ``More options``."""
+    """Command whose help lists `USUAL_OPTIONS` first, and the other options under ``More options``."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options of the help."""
+        """Write the options into the help."""
         declared = [parameter for parameter in self.get_params(ctx) if isinstance(parameter, click.Option)]
         shown = [
             (shown_option, help_record)
@@ -93,37 +94,39 @@ class GroupedCommand(click.Command):
         ]
         places = {f"--{name}": place for place, name in enumerate(USUAL_OPTIONS)}
 
-        def place(parameter: click.Parameter) -> int | None:
+        def rank(parameter: click.Parameter) -> int | None:
+            """Return the place of an option among the usual options; None for another option."""
             return next((places[name] for name in parameter.opts if name in places), None)
 
-        usual = sorted((pair for pair in shown if place(pair[0]) is not None), key=lambda pair: place(pair[0]) or 0)
-        rest = [pair for pair in shown if place(pair[0]) is None]
+        usual = sorted((pair for pair in shown if rank(pair[0]) is not None), key=lambda pair: rank(pair[0]) or 0)
+        rest = [pair for pair in shown if rank(pair[0]) is None]
         for title, pairs in (("Options", usual), ("More options", rest)):
             with formatter.section(title):
                 formatter.write_dl([help_record for _, help_record in pairs])
 
 
 def command(name: str, **further: Any) -> Callable[[Command], click.Command]:
-    """Return a decorator that makes a command, whose help lists the usual options first."""
+    """Return a decorator that makes a `GroupedCommand` with this name."""
     return click.command(name, cls=GroupedCommand, **further)
 
 
-def option(names: str, metavar: str | None, kind: object, text: str, **further: Any) -> Option:
+def option(names: str, metavar: str | None, value_type: object, text: str, **further: Any) -> Option:
     """Return an option with a value; the help shows its default.
 
     Parameters
     ----------
-    names : as ``-o --output directory``: the last name, if it has no dash, is the name of the argument
-    kind : type of the value, or the function that reads it
+    names : for example ``-o --output directory``; a last name without a dash is the name of the argument
+    metavar : word for the value in the help; None: chosen by click
+    value_type : type of the value, or a function that reads it
     text : text of the help
     further : further arguments of `click.option`
     """
     further = {"show_default": further.get("default") is not None} | further
-    return click.option(*names.split(), metavar=metavar, type=kind, help=text, **further)
+    return click.option(*names.split(), metavar=metavar, type=value_type, help=text, **further)
 
 
 def choice(names: str, words: Sequence[str], text: str, **further: Any) -> Option:
-    """Return an option whose value is one of some words."""
+    """Return an option whose value is one of the given words."""
     return option(names, None, click.Choice(words), text, **further)
 
 
@@ -138,14 +141,15 @@ def options_as_record(name: str, home: str | Callable[..., Any], *options: Optio
     Parameters
     ----------
     name : name of the argument
-    home : type of the record, or its place as ``icrtool.config:ConfigSources``, which is imported when the command is
-        called. An option with the name of a field sets this field, if the option is given. The command receives the
-        other options
-    change : the argument is a function that returns a dataclass with the given options changed
+    home : type of the record, or its place, for example ``icrtool.config:ConfigSources``, which is imported when the
+        command is called. An option with the name of a field sets this field if the user gives the option. The command
+        receives the options without a field
+    options : the options to add
+    change : the argument is not a record, but a function that returns a given dataclass with these fields changed
     """
-    bare = add_options(lambda: None, *options)
-    of_record = {parameter.name for parameter in bare.__dict__.get("__click_params__", ())}.union(
-        bare.__dict__.get("made", ())
+    without_command = add_options(lambda: None, *options)
+    declared = {parameter.name for parameter in without_command.__dict__.get("__click_params__", ())}.union(
+        without_command.__dict__.get("made", ())
     )
 
     def add(command: Command) -> Command:
@@ -153,7 +157,7 @@ def options_as_record(name: str, home: str | Callable[..., Any], *options: Optio
         def call(**arguments: Any) -> object:
             record = resolve_name(home) if isinstance(home, str) else home
             fields = {
-                field: arguments.pop(field) for field in of_record.intersection(signature(record).parameters, arguments)
+                field: arguments.pop(field) for field in declared.intersection(signature(record).parameters, arguments)
             }
             values = {field: value for field, value in fields.items() if value is not None}
             record_or_change = (lambda old: replace(old, **values)) if change else record(**values)
@@ -178,12 +182,12 @@ def option_group(*options: Option) -> Option:
 
 
 class _Path(click.Path):
-    """A path on disk or, with `addresses`, also an address.
+    """Type of a path on disk or, with `addresses`, also of an address.
 
     Parameters
     ----------
-    addresses : addresses are accepted. The reader of the log, not click, checks that the path can be read
-    check : name of a function (``module:function``) that refuses an unwritable place before any work is done
+    addresses : accept addresses. The reader of the log then checks that the path can be read, not click
+    check : name of a function (``module:function``) that refuses a place that cannot be written; empty: no check
     """
 
     def __init__(self, *, addresses: bool = False, check: str = "") -> None:
@@ -191,15 +195,15 @@ class _Path(click.Path):
         self._addresses, self._check = addresses, check
 
     def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path."""
+        """Return the path or address in a text."""
         if not os.fspath(value):
             # An empty text would be the current directory.
-            self.fail("an empty name: is a variable of the shell not set?", param, ctx)
+            self.fail("the name is empty; check that the shell variable in it is set", param, ctx)
         address = place_of(os.fspath(value))
         if isinstance(address, UrlPath):
             if not self._addresses:
-                self.fail(f"{escaped(str(address))}: an address is not taken here; name a place on disk", param, ctx)
-            # click's own conversion would lose a slash, and the text after a question mark.
+                self.fail(f"{escaped(str(address))}: is an address; name a place on disk", param, ctx)
+            # click's own conversion would drop a slash, and the text after a question mark.
             return address
         path = cast("Path", super().convert(value, param, ctx))
         if self._check:
@@ -208,13 +212,16 @@ class _Path(click.Path):
 
 
 LOG = PLACE = _Path(addresses=True)
+"""Types of a log, and of a place of results: a path on disk or an address."""
+
 LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 FILE, NEW_FILE = _Path(), _Path(check="icrtool.output.files.atomic:check_place")
 NEW_PICTURE = _Path(check="icrtool.output.files.formats:check_picture")
+"""Types of a path on disk, of a file that the command writes, and of a picture that it writes."""
 
 
 def numbers_reader(form: str, count: int | None = None) -> Callable[[str], tuple[float, ...]]:
-    """Return a function that reads numbers separated by commas; the error message shows `form`."""
+    """Return a function that reads finite numbers separated by commas, `count` of them if given; errors show `form`."""
 
     def read(text: str) -> tuple[float, ...]:
         try:
@@ -229,7 +236,7 @@ def numbers_reader(form: str, count: int | None = None) -> Callable[[str], tuple
 
 
 def complete_robot(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the built-in robots that begin with `incomplete`."""
+    """Return the built-in robots whose name begins with `incomplete`."""
     return [
         CompletionItem(name, help=f"track width {robot['track_width_m']:g} m")
         for name, robot in config.builtin_robots().items()
@@ -256,15 +263,15 @@ def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str
 
 
 def topics_of(logs: object) -> tuple[str, ...]:
-    """Return the topics of the logs on the command line; only topics with valid ROS names.
+    """Return the topics of the logs on the command line whose names are valid in ROS.
 
-    Bash inserts a completion without quotes, so any other text of a log could be run as a command. Logs that cannot be
-    read are skipped.
+    Bash inserts a completion without quotes, so any other text of a log could run as a command. Logs that cannot be
+    read are left out.
     """
     topics: set[str] = set()
     for log in logs if isinstance(logs, tuple | list) else ():
         if log == "-":
-            continue  # a completion must not wait for standard input
+            continue  # A completion must not wait for standard input.
         try:
             container = open_log.open_log(Path(log))
         except errors.IcrToolError:
@@ -277,11 +284,11 @@ def topics_of(logs: object) -> tuple[str, ...]:
 
 
 def _limit(variable: str, read: str) -> Callable[[click.Context, click.Parameter, str | None], None]:
-    """Return a callback that reads the value of an input limit, and sets this limit while the command runs.
+    """Return a callback that sets an input limit while the command runs.
 
     Parameters
     ----------
-    variable, read : names of the variable and of the function that reads its value, in `icrtool.records.input_limits`
+    variable, read : name of the limit, and of the function that reads its value, in `icrtool.records.input_limits`
     """
 
     def set_limit(context: click.Context, _option: click.Parameter, text: str | None) -> None:
@@ -297,14 +304,14 @@ def _limit(variable: str, read: str) -> Callable[[click.Context, click.Parameter
 
 
 INPUT_LIMITS = option_group(
-    option("--most-bytes", "N", None, "Most that is saved of standard input or of a file at an address, for example "
-           "800000, 500M or 2GB; default: half of the free space of the temporary folder.",
+    option("--most-bytes", "N", None, "Largest part of standard input, or of a file at an address, that is saved: for "
+           "example 800000, 500M or 2GB; default: half of the free space of the temporary folder.",
            expose_value=False, callback=_limit("MOST_BYTES", "bytes_in")),
-    option("--server-timeout", "SECONDS", None, "Give up a server that sends nothing for this time, or less than "
-           "10 kB/s after it; default: 15.",
+    option("--server-timeout", "SECONDS", None, "Give up a server that sends nothing for this time, or then less "
+           "than 10 kB/s; default: 15.",
            expose_value=False, callback=_limit("SERVER_TIMEOUT_S", "seconds_in")),
 )  # fmt: skip
-"""--most-bytes and --server-timeout, which hold while the command runs, and in the processes that it starts."""
+"""--most-bytes and --server-timeout. They hold while the command runs, also in the processes that it starts."""
 
 CONFIGURATION = options_as_record(
     "settings",
@@ -321,18 +328,18 @@ CONFIGURATION = options_as_record(
 PLACES = options_as_record(
     "place",
     ResultPlace,
-    option("-o --output", "DIR", PLACE, "Run directory of the log; with several logs: the folder of their run "
+    option("-o --output", "DIR", PLACE, "Run directory of the log; for several logs, the folder of their run "
            "directories."),
     option("--into", "DIR", PLACE, "Folder of the run directories, also for one log."),
-    flag("--overwrite", "Also replace the run of another recording, or one that was made with other settings."),
+    flag("--overwrite", "Also replace the run of another recording, or a run that was made with other settings."),
 )  # fmt: skip
 """-o and --into as `place`, and --overwrite."""
 
 
 CUT = option_group(
-    option("--from start", "TIME", None, "Read the log from here: seconds since the log's first message, or a time in "
-           "ISO 8601 (UTC without a zone)."),
-    option("--to end", "TIME", None, "Read the log up to here."),
+    option("--from start", "TIME", None, "Read the log from this time on: seconds since its first message, or a time "
+           "in ISO 8601 (UTC if it has no zone)."),
+    option("--to end", "TIME", None, "Read the log up to this time."),
 )  # fmt: skip
 """--from and --to, as `start` and `end`."""
 
@@ -343,11 +350,13 @@ VERBOSE_OPTION = flag("-v --verbose", "Print more details.")
 
 
 def printer_options(*options: Option) -> Option:
-    """Add some of the options -q, -v and --json, as the argument `printer`."""
+    """Return a decorator that adds some of the options -q, -v and --json, as the argument `printer`."""
     return options_as_record("printer", Printer, *options)
 
 
-SEED = option("--seed", None, click.IntRange(min=0), "Seed of all noise; the same seed, the same numbers.", default=0)
+SEED = option(
+    "--seed", None, click.IntRange(min=0), "Seed of all noise; the same seed gives the same numbers.", default=0
+)
 
 
 def plot_formats(text: str) -> tuple[str, ...]:
@@ -364,24 +373,28 @@ def plot_formats(text: str) -> tuple[str, ...]:
 
 PLOTS_OPTION = option("--plots", "png,svg,pdf|none", plot_formats, "Formats of the pictures.", default="png")
 FIGURES_OPTION = choice(
-    "--figures", get_args(FigureSet), "all: also those of the paper, such as a histogram a distance.", default="default"
+    "--figures",
+    get_args(FigureSet),
+    "all: also the figures of the paper, for example a histogram for each distance.",
+    default="default",
 )
 BUDGETS = option(
-    "--budget budgets_m", "METRES", POSITIVE, "Report how far 95 % of the errors stay within this; repeatable.",
+    "--budget budgets_m", "METRES", POSITIVE, "Report the distance over which 95 % of the errors stay within this "
+    "error; repeatable.",
     multiple=True, default=(0.5,),
 )  # fmt: skip
 CALIBRATION_OPTIONS = option_group(
     option("--calibration calibrations", "CAL.json", FILE, "Also predict with a calibration that icrtool calibrate "
            "wrote; repeatable.", multiple=True),
-    flag("--refit-sensors", "Refit heading offset, delays and gyro bias of the calibrations in this log, in place of "
-         "those that they hold."),
+    flag("--refit-sensors", "Refit heading offset, delays and gyro bias in this log; the constants of the calibrations "
+         "are not used."),
 )  # fmt: skip
 """--calibration as `calibrations`, and --refit-sensors; `calibrations_of` reads the files."""
-ALLOW_UNUSABLE = flag("--allow-unusable", "Give distances and numbers of runs that are not usable, too.")
+ALLOW_UNUSABLE = flag("--allow-unusable", "Also give the distances and numbers of runs that are not usable.")
 
 
 def _split_gates(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the limits in the lines of each text. A blank text is kept, and is refused later as an invalid limit."""
+    """Return the limits in the lines of each text; refuse an invalid limit, also a blank text."""
     lines = tuple(line for gate in gates for line in [line for line in gate.splitlines() if line.strip()] or [gate])
     for line in lines:
         try:
@@ -396,13 +409,13 @@ def _split_gates(_context: click.Context, _option: click.Parameter, gates: tuple
 
 
 class Exports(NamedTuple):
-    """Files for CI: JUnit XML (--junit) and a summary for a pull request (--markdown)."""
+    """Paths of the files for CI: JUnit XML (--junit), and a summary for a pull request (--markdown)."""
 
     junit: Path | None = None
     markdown: Path | None = None
 
     def write(self, command: str, suites: Callable[[], Sequence[acceptance.Suite]], text: Callable[[], str]) -> None:
-        """Write the files that the user asked for: verdicts as JUnit XML, and a summary in Markdown."""
+        """Write the requested files; `suites` and `text` compute their content only if a file is requested."""
         if self.junit is not None:
             acceptance.write_junit(self.junit, suites(), command)
         if self.markdown is not None:
@@ -410,21 +423,24 @@ class Exports(NamedTuple):
 
 
 def report_options(*further: Option) -> Option:
-    """Add the options of a report as `report`, `files`, `exports` and `baseline`; `further`: options of one command."""
-    of_report = options_as_record(
+    """Return a decorator that adds the options of a report, and further options.
+
+    The command receives them as `report`, `files`, `exports` and `baseline`.
+    """
+    report_only = options_as_record(
         "report",
         f"{REQUESTS_MODULE}:ReportRequest",
         *further,
         CALIBRATION_OPTIONS,
         BUDGETS,
-        option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one a line: exit status 3 if one is not "
-               "met; repeatable.", multiple=True, callback=_split_gates),
+        option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one on each line; exit status 3 if a "
+               "limit is not met; repeatable.", multiple=True, callback=_split_gates),
         option("--baseline", "REPORT.json|DIR", FILE, "Earlier report, run or batch to compare with; a limit may then "
-               "read \"icr.p95@10m <= 1.1 * baseline\"."),
-        flag("--strict-gates", "Compare limits relative to the baseline by their number alone, without the "
-             "confidence interval of the difference."),
-        flag("--ladder/--no-ladder", "Also test the rows recommended and controller, with a gyro too, on "
-             "distance that they were not fitted to.", default=True, show_default=True),
+               "be \"icr.p95@10m <= 1.1 * baseline\"."),
+        flag("--strict-gates", "Check limits relative to the baseline by the number alone, without the confidence "
+             "interval of the difference."),
+        flag("--ladder/--no-ladder", "Also test the rows recommended and controller, without and with a gyro, "
+             "on distance that they were not fitted to.", default=True, show_default=True),
         option("--junit", "FILE", NEW_FILE, "Write the verdicts on the limits as JUnit XML."),
         option("--markdown", "FILE", NEW_FILE, "Write a summary for a pull request."),
         ALLOW_UNUSABLE,
@@ -433,12 +449,12 @@ def report_options(*further: Option) -> Option:
         flag("--page/--no-page", "Also write report.html: pictures, tables and an interactive map in one file.",
              default=True, show_default=True),
     )  # fmt: skip
-    files = options_as_record("files", f"{REQUESTS_MODULE}:ResultFiles", of_report)
+    files = options_as_record("files", f"{REQUESTS_MODULE}:ResultFiles", report_only)
     return options_as_record("exports", Exports, files)
 
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.Baseline | None:
-    """Return the reports of --baseline; refuse invalid gates, and gates that need a baseline where none is given."""
+    """Return the reports of --baseline, None without it; refuse limits that need a missing baseline."""
     relative = [gate for gate in gates if names_baseline(gate)]
     if place is not None:
         return dropout_directory.open_baseline(place)
@@ -461,15 +477,15 @@ def names_baseline(gate: str) -> bool:
 
 
 def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
-    """Refuse a baseline without any of the logs, because a gate that is never checked would always pass."""
+    """Refuse a baseline that has none of the logs, because a limit that is never checked would always be met."""
     relative = [bool(verdict.not_checked) for verdict in verdicts if verdict.relative]
     if relative and all(relative):
         advice = "logs are matched by content, else by name"
-        raise errors.ConfigError("--baseline", "none of these logs is in it", advice)
+        raise errors.ConfigError("--baseline", "has none of these logs", advice)
 
 
 def options_to_repeat(settings: ConfigSources, request: FitRequest) -> list[str]:
-    """Return the options of this call that the proposed next command needs too."""
+    """Return the options of this call that the next command needs too."""
     pairs = [
         ("--config", settings.file),
         ("--robot", settings.robot),

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from icrtool.records.run import Run
 
 CLEAR = "\r\x1b[K"
+"""Control characters that clear the current line of a terminal."""
+
 REFRESH_S = 0.1
 """Shortest time between two updates of the progress on a terminal [s]."""
 
@@ -41,13 +43,14 @@ WIDEST = 120
 """Largest used width of a terminal [characters]."""
 
 FEWEST_COLUMNS = 3
-"""Smallest number of columns of a table that a narrow terminal shows."""
+"""Smallest number of columns of a table on a narrow terminal. Further columns are left out where they do not fit."""
 
 TEXT_STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
+"""Styles of rich by the look of a line."""
 
 
 def print_document(blocks: Iterable[Block], *, verbose: bool) -> None:
-    """Print a document. ``NO_COLOR`` and ``TERM=dumb`` are respected; nothing in its text is read as markup."""
+    """Print a document. ``NO_COLOR`` and ``TERM=dumb`` are respected; its text is not read as markup."""
     if not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
         click.echo(format_blocks(blocks, verbose=verbose))
         return
@@ -66,6 +69,7 @@ def print_document(blocks: Iterable[Block], *, verbose: bool) -> None:
 
 
 def _print_table(block: Table, console: Console) -> None:
+    """Print a table on a terminal; columns that do not fit are left out and named."""
     from rich.table import Table as RichTable
     from rich.text import Text as RichText
 
@@ -74,7 +78,7 @@ def _print_table(block: Table, console: Console) -> None:
     sides = table.sides()
     for number, side in enumerate(sides):
         head = RichText(str(table.head[number])) if table.head else ""
-        # The sentence in the last column is wrapped; names and numbers are not.
+        # Only the last column is wrapped, because it may hold a sentence.
         last = number == len(sides) - 1
         shown.add_column(
             head, justify="left" if side == "l" else "right", no_wrap=not last or side == "r", header_style="bold",
@@ -97,18 +101,18 @@ def write_or_print(text: str, output: Path | None) -> None:
 
 
 def signal_word(word: str, color: str) -> str:
-    """Return the word that begins a line on standard error, coloured on a terminal; NO_COLOR is respected."""
+    """Return the first word of a line on standard error, coloured on a terminal; NO_COLOR is respected."""
     wanted = sys.stderr.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     return click.style(word, fg=color, bold=True) if wanted else word
 
 
 def print_error(text: str) -> None:
-    """Print the line about an error on standard error."""
+    """Print an error as a line on standard error."""
     click.echo(f"{signal_word('Error:', 'red')} {text}", err=True)
 
 
 class Printer(NamedTuple):
-    """Printer of a command, with its options -q, -v and --json."""
+    """Printer of a command's results, warnings and stages, by its options -q, -v and --json."""
 
     quiet: bool = False
     verbose: bool = False
@@ -120,21 +124,21 @@ class Printer(NamedTuple):
         return not (self.quiet or self.as_json)
 
     def show(self, blocks: Iterable[Block]) -> None:
-        """Print a document as text; with -v the whole document."""
+        """Print a document as text: all of it with -v, else the brief answer."""
         if self.shows:
             print_document(blocks, verbose=self.verbose)
 
     def text(self, text: str) -> None:
-        """Print a result that is text already."""
+        """Print a text of the results."""
         if self.shows:
             click.echo(text)
 
     def json(self, command: str, document: msgspec.Struct | Mapping[str, object]) -> None:
-        """With --json, print the document of a command; its own schema is replaced by ``icrtool/<command>/1``.
+        """Print the document of a command with --json; its schema becomes ``icrtool/<command>/1``.
 
         Parameters
         ----------
-        command : its name on the command line
+        command : name of the command on the command line
         document : a record, or plain data with arrays of numpy; infinity and NaN become null
         """
         if not self.as_json:
@@ -144,22 +148,25 @@ class Printer(NamedTuple):
         click.echo(formats.json_bytes(content), nl=False)
 
     def detail(self, text: str) -> None:
-        """Print a line on standard error, with -v."""
+        """Print a line on standard error with -v."""
         if self.verbose:
             click.echo(text, err=True)
 
     def warn(self, warnings: Iterable[str]) -> None:
-        """Print warnings on standard error."""
+        """Print warnings on standard error, unless -q is given."""
         if not self.quiet:
             for warning in warnings:
                 click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
 
     def warn_about(self, run: Run, *, most: int | None = None) -> None:
-        """Print the warnings of a run, with -v also why each stream was chosen.
+        """Print the warnings of a run; with -v also the reason for the choice of each stream.
 
-        At most `most` warnings are printed, the gravest first, then the number of the others; -v and --json print all.
+        Parameters
+        ----------
+        most : largest number of warnings, the gravest first, before the number of the others; None: all. -v and --json
+            print all
         """
-        # On a terminal the result names the gravest warning, so warnings are printed only with -v or --json.
+        # The result on a terminal names the gravest warning, so warnings are printed there only with -v or --json.
         if self.verbose or self.as_json or most is None:
             self.warn(run.warnings if self.verbose or self.as_json or not sys.stderr.isatty() else ())
         elif not sys.stderr.isatty():
@@ -173,24 +180,28 @@ class Printer(NamedTuple):
                 self.detail(f"{samples.ROLE_WORDS[stream.role]}: {topics}: {stream.why}")
 
     def stages(self, name: str) -> Stages:
-        """Return the stages of the work on one log."""
+        """Return a display of the stages of the work on the log of this name."""
         return Stages(name, quiet=self.quiet, verbose=self.verbose)
 
     @contextmanager
     def progress(self, label: str) -> Iterator[Callable[[float], None]]:
-        """Yield a function that shows the finished share of the work of one stage, 0 to 1."""
+        """Yield a function that shows the finished share of a work, 0 to 1, next to its label."""
         with Stages(label, quiet=self.quiet) as stages:
             stages.begin("")
             yield stages.share
 
 
 class Inputs:
-    """The inputs of a command. An error of one input is reported at once, and the other inputs are still processed.
+    """The inputs of a command. An error of one input is printed at once, and the other inputs are processed.
+
+    Parameters
+    ----------
+    key : key of an input in the output of --json
 
     Attributes
     ----------
-    documents : output of --json for each input, which begins with its place and its status
-    errors : why an input could not be used, by the place of the input
+    documents : output of --json for each input; it begins with the place and the status of the input
+    errors : error of each input that could not be used, by its place
     """
 
     def __init__(self, key: str) -> None:
@@ -200,7 +211,7 @@ class Inputs:
 
     @contextmanager
     def each(self, source: Path) -> Iterator[dict[str, Any]]:
-        """Run the block on one input, report its errors, and yield the document of the input."""
+        """Yield the document of one input to the block, and print an error that the block raises."""
         document: dict[str, Any] = {self._key: escaped(str(source)), "status": "done"}
         self.documents.append(document)
         try:
@@ -213,7 +224,10 @@ class Inputs:
             print_error(str(err) if named else f"{name}: {err}")
 
     def exit_if_failed(self, inputs_word: str, *, gate_failed: bool = False) -> None:
-        """Exit with status 3 if an acceptance limit was not met, else 1 if an input (a `what`) could not be used."""
+        """Exit with status 3 if an acceptance limit was not met, else with 1 if an input could not be used.
+
+        `inputs_word` is the word for the inputs in the last error.
+        """
         failed = [shortened(escaped(source), LONGEST_NAME) for source in self.errors]
         if failed and len(self.documents) > 1:
             print_error(f"{len(failed)} of {len(self.documents)} {inputs_word} could not be used: {listed(failed, 5)}")
@@ -222,7 +236,7 @@ class Inputs:
 
 
 class LiveLine:
-    """A line on a terminal about the current work; the next output replaces it."""
+    """A line on a terminal about the current work. The next output replaces it."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         self.on_terminal = not quiet and sys.stderr.isatty()
@@ -241,13 +255,13 @@ class LiveLine:
 
 
 class Stages(LiveLine):
-    """Display of the stages of the work on one log, erased from the terminal at the end.
+    """Display of the stages of the work on one log. It is erased from the terminal at the end.
 
     Parameters
     ----------
-    name : name of the log, printed before the stage
+    name : name of the log, which stands before the stage
     quiet : print nothing
-    verbose : where standard error is no terminal, print a line for each stage
+    verbose : print a line for each stage if standard error is not a terminal
     """
 
     def __init__(self, name: str, *, quiet: bool = False, verbose: bool = False) -> None:
@@ -268,11 +282,11 @@ class Stages(LiveLine):
         super().__exit__(*raised)
 
     def _compiling(self) -> None:
-        """Show that kernels are being compiled, for which the first command on a computer waits."""
+        """Show that kernels are being compiled, because the first command on a computer waits for this."""
         self.rewrite(f"{self._title} (compiling, once on this computer: about 8 s) …")
 
     def begin(self, stage: str) -> None:
-        """Begin a stage with this name, for example ``reading``."""
+        """Show the begin of a stage with this name, for example ``reading``."""
         self._title = f"{self.name}: {stage}" if stage else self.name
         self._shown_s = time.monotonic()
         self.rewrite(f"{self._title} …")

@@ -1,4 +1,4 @@
-"""``icrtool report``, which answers on a log or writes the page of a result, and ``icrtool compare`` for groups."""
+"""``icrtool report``, the answer about a log or the page of a result, and ``icrtool compare``, for groups of runs."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ if TYPE_CHECKING:
 
 @click.command("report")
 @click.argument("sources", metavar="[LOG|RUN|FLEET|COMPARISON|CAL.json]...", nargs=-1, type=options.LOG)
-@option("-o --output", "FILE", FILE, "The page; default: report.html in the directory of the run or fleet.")
+@option("-o --output", "FILE", FILE, "File of the page; default: report.html in the directory of the run or fleet.")
 @flag("--no-coordinates", "Leave out the place on the globe, for a page that others will read.")
 @option("--into", "DIR", FILE, "Folder of the run directories of logs; default: icrtool-runs.")
-@flag("--overwrite", "Also replace the run of another recording, or one that was made with other settings.")
+@flag("--overwrite", "Also replace the run of another recording, or a run that was made with other settings.")
 @options.options_as_record("report", f"{options.REQUESTS_MODULE}:ReportRequest", options.CALIBRATION_OPTIONS)
 @options.CONFIGURATION
 @options.INPUT_LIMITS
@@ -56,13 +56,13 @@ def report_command(
     sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, into: Path | None, overwrite: bool,
     calibrations: tuple[Path, ...], report: requests.ReportRequest, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
-    """Answer the whole question of a LOG on one screen and one page; or write the page of a result.
+    """Fit and test a LOG, with the answer on one screen and one page; or write the page of a result.
 
-    A LOG is fitted, unless its run is there, and tested: numbers for the controller, how far without GNSS, whether to
-    trust them, and the worst case. RUN is a directory that `icrtool fit` wrote, with or without its dropout report,
-    which --calibration makes again; FLEET the folder of `icrtool batch`; COMPARISON what `icrtool compare -o` wrote,
-    CAL.json what `icrtool calibrate -o` wrote. Without an argument: the newest run below icrtool-runs/. A page is one
-    HTML file that needs no network.
+    A LOG is fitted, unless its run exists, and tested. The answer has numbers for the controller, the distance without
+    GNSS, reasons for trust, and the worst case. RUN is a directory that `icrtool fit` wrote, with or without its
+    dropout report; with --calibration the report is made again. FLEET is the folder of `icrtool batch`, COMPARISON a
+    file of `icrtool compare -o`, CAL.json a file of `icrtool calibrate -o`. Without an argument, the newest run below
+    icrtool-runs/ is used. A page is one HTML file that needs no network.
 
     \b
     Example:
@@ -81,7 +81,7 @@ def report_command(
     logs = tuple(source for source in sources if is_log(source))
     again = tuple(source for source in sources if calibrations and run_directory.is_run_directory(source))
     if calibrations and (others := [source for source in sources if source not in {*logs, *again}]):
-        why = f"{escaped(str(others[0]))} is no log and no run, and its page shows the result that is there"
+        why = f"{escaped(str(others[0]))} is neither a log nor a run, so no report is made for its page"
         raise errors.ConfigError("--calibration", why, "name logs or runs")
     if not logs:
         check_run_config(config, free="dropout" if again else "")
@@ -107,7 +107,7 @@ def _report_on_log(
     source: Path, place: Place, config: Config, report: requests.ReportRequest, files: requests.ResultFiles,
     other_results: dropout_report.OtherResults, printer: Printer,
 ) -> None:  # fmt: skip
-    """Print the report on a log, and write its run and report; an existing run is not fitted again."""
+    """Write the run and the report of a log, and print the report; an existing run is not fitted again."""
     request = report.configured(config)
     has_run = run_directory.holds_run_of(path_of(place), source, config, request.fit)
     if has_run:
@@ -117,12 +117,12 @@ def _report_on_log(
 
 
 def _write_page(source: Path, output: Path | None, *, coordinates: bool, answers: bool, printer: Printer) -> None:
-    """Write the page of a result into its folder or to `output`; with `answers`, also print the answers of a run."""
+    """Write the page of a result to `output` or into its folder; with `answers`, also print the report of a run."""
     if isinstance(source, UrlPath):
-        advice = "copy it to a place on disk, or write its page there: icrtool dropout-report ADDRESS"
+        advice = "copy it to a disk, or write its page to the address: icrtool dropout-report ADDRESS"
         raise errors.RunError(source, "is a run at an address", advice)
     place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
-    # The folder of a result may hold files of a stranger.
+    # A stranger may have put files into the folder of a result, so only a page is replaced there.
     file, ours = (Below(place.parent, place.name), run_directory.is_page) if output is None else (place, None)
     atomic.check_place(file, ours)
     if run_directory.is_run_directory(source):
@@ -137,7 +137,13 @@ def _write_page(source: Path, output: Path | None, *, coordinates: bool, answers
 
 
 def _page_of(source: Path) -> str:
-    """Return the page of a fleet, a comparison or a calibration."""
+    """Return the page of a fleet, a comparison or a calibration.
+
+    Raises
+    ------
+    RunError
+        The place has none of these, or another version wrote it.
+    """
     fleet = source / fleet_document.FLEET_FILE
     if formats.schema_of(Below(source, fleet_document.FLEET_FILE)).startswith(fleet_document.FLEET_FAMILY):
         with _as_written(fleet, "run icrtool batch again"):
@@ -159,7 +165,7 @@ def _page_of(source: Path) -> str:
 
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> tuple[str, list[Block]]:
-    """Return the page of a run, and its answers; a missing report and missing pictures are made for the page."""
+    """Return the page of a run and the blocks of its report; a missing report and missing pictures are made for it."""
     run, report = run_directory.open_run(directory), pages.read_report(directory)
     pictures = pages.pictures_of_run(directory)
     if "trajectory" not in pictures:
@@ -172,7 +178,7 @@ def _page_of_run(directory: Path, *, coordinates: bool) -> tuple[str, list[Block
 
 @contextmanager
 def _as_written(place: Path, advice: str) -> Iterator[None]:
-    """Refuse a document that was edited or that another version wrote."""
+    """Raise a RunError if the block fails, because a document was edited or another version wrote it."""
     from jinja2 import TemplateError
 
     try:
@@ -183,7 +189,7 @@ def _as_written(place: Path, advice: str) -> Iterator[None]:
 
 @click.command("compare")
 @click.argument("sources", metavar="[NAME=]RUN|LOG|FOLDER...", nargs=-1, required=True)
-@option("--csv", "FILE", NEW_FILE, "Write the transfer matrix: the errors of each calibration in each group.")
+@option("--csv", "FILE", NEW_FILE, "Write the errors of the calibration of each group in each group (transfer matrix).")
 @option("-o --output", "FILE", NEW_FILE, "Write the comparison as JSON, for icrtool report.")
 @option("--plot", "FILE", NEW_PICTURE, "Draw the comparison: png, svg, pdf.")
 @options.CONFIGURATION
@@ -197,10 +203,11 @@ def compare_command(
     settings: ConfigSources,
     printer: Printer,
 ) -> None:
-    """Compare groups of runs: ICRs, multiplier and errors, and what the calibration of one costs on another.
+    """Compare groups of runs: ICRs, multiplier, errors, and the errors of the calibration of one group in another.
 
-    Each argument is a group: a run, a log, or a folder of runs or logs; arguments of one NAME are one group. The first
-    group is compared with each of the others. The folder of a batch, given alone, stands for its robots and groups.
+    Each argument is a group: a run, a log, or a folder of runs or logs; arguments with the same NAME are one group. The
+    first group is compared with each of the other groups. The folder of a batch, as the only argument, stands for its
+    robots and groups.
 
     \b
     Example:
@@ -209,15 +216,15 @@ def compare_command(
       icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
     """  # noqa: D301 - click reads the escape
     config = settings.load()
-    calibrations = [
+    places_of_groups = [
         (name, run_or_log)
         for name, places in groups_of(sources).items()
         for path in places
         for run_or_log in runs_or_logs(path)
     ]
     groups: dict[str, list[Run]] = {}
-    runs = runs_named([path for _, path in calibrations], config, printer)
-    for (name, _), run in zip(calibrations, runs, strict=True):
+    runs = runs_named([path for _, path in places_of_groups], config, printer)
+    for (name, _), run in zip(places_of_groups, runs, strict=True):
         groups.setdefault(name, []).append(run)
     compared = transfer.compare_groups(groups)
     for file, content in ((csv, tables.transfer_csv(compared)), (output, formats.json_bytes(compared))):

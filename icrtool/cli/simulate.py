@@ -1,4 +1,4 @@
-"""``icrtool simulate``, one drive as a log, and ``icrtool study``, many drives filtered; both by the same options."""
+"""``icrtool simulate``, which writes one drive as a log, and ``icrtool study``, which filters many drives."""
 
 from __future__ import annotations
 
@@ -46,22 +46,26 @@ GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
 """Standard deviation of the position noise by kind of receiver [m] (Pentzer 2014, Sections 4 and 6.5)."""
 
 DEFAULT_ROBOT = "pentzer-tracked"
+"""Robot of a simulation without a configured robot."""
+
 DEFAULT_MULTIPLIER = 1.5
-"""Default of the true y ICRs, in half track widths; the default of x is 0."""
+"""Default of the true y ICRs, in half track widths. The default of x is 0."""
 
 ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
+"""Default rates of wheel messages with counted travel, and with motor commands [Hz]."""
+
 PAPER_COUNTS = 8192.0
-"""Encoder counts of a wheel revolution for a robot without configured counts."""
+"""Encoder counts of a wheel revolution, for a robot without configured counts."""
 
 
 def change_text(text: str) -> tuple[float, tuple[float, ...]]:
-    """Return the change of the ICRs in a text ``T:YR,YL,X``."""
+    """Return the time [s] and the ICRs [m] in a text ``T:YR,YL,X``."""
     time, _, icrs = text.partition(":")
     return numbers_reader("T:YR,YL,X", 1)(time)[0], numbers_reader("T:YR,YL,X", 3)(icrs)
 
 
 def span_text(text: str) -> tuple[float, ...]:
-    """Return begin and end [s] in a text ``BEGIN:END``."""
+    """Return begin and end [s] in a text ``BEGIN:END``; refuse a span that ends before it begins."""
     span = numbers_reader("BEGIN:END", 2)(text.replace(":", ",", 1) if ":" in text else "")
     if span[1] <= span[0]:
         raise click.BadParameter(f"{text!r} ends before it begins")
@@ -69,7 +73,7 @@ def span_text(text: str) -> tuple[float, ...]:
 
 
 def gnss_text(text: str) -> float:
-    """Return the position noise [m] of ``rtk``, ``waas`` or a number of metres."""
+    """Return the standard deviation of positions [m] in a text: ``rtk``, ``waas`` or a number of metres."""
     if text in GNSS_NOISE_M:
         return GNSS_NOISE_M[text]
     metres = numbers_reader("rtk, waas or METRES", 1)(text)[0]
@@ -82,7 +86,7 @@ def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) ->
     """Refuse a change of the ICRs after the end of a drive."""
     unreached = next((time for time, _ in changes if time >= duration_s), None)
     if unreached is not None:
-        why = f"no change at {unreached:g} s: the drive lasts {duration_s:g} s"
+        why = f"{unreached:g} s is after the end of the drive, which lasts {duration_s:g} s"
         raise click.BadParameter(why, param_hint="--change")
 
 
@@ -100,33 +104,38 @@ DRIVE = (
         "--icrs icrs_m",
         "YR,YL,X",
         numbers_reader("YR,YL,X", 3),
-        "True ICRs [m]; default: by the robot's width, or the study's.",
+        "True ICRs [m]; default: from the robot's track width, or from the study.",
     ),
-    ("--path kind", None, click.Choice(get_args(PathKind)), "Path to drive; study convergence then has no other."),
-    ("--duration duration_s", "S", POSITIVE, "Duration of a drive [s]; default: 100, or the study's."),
-    ("--speed speed_mps", "MPS", POSITIVE, "Speed of the body; on the spot: of the faster track."),
+    (
+        "--path kind",
+        None,
+        click.Choice(get_args(PathKind)),
+        "Path to drive; study convergence then uses this path alone.",
+    ),
+    ("--duration duration_s", "S", POSITIVE, "Duration of a drive [s]; default: 100, or from the study."),
+    ("--speed speed_mps", "MPS", POSITIVE, "Speed of the body [m/s]; for spins on the spot, of the faster track."),
     ("--radius radius_m", "M", NOT_NEGATIVE, "Radius of circles and of the tightest bends."),
     ("--leg leg_m", "M", POSITIVE, "Length of a lawnmower's legs."),
-    ("--encoder-counts", "N", POSITIVE, "Counts per wheel turn; default: the robot's, or 8192."),
+    ("--encoder-counts", "N", POSITIVE, "Encoder counts of a wheel turn; default: from the robot, else 8192."),
     ("--input-noise input_noise_mps", "MPS", NOT_NEGATIVE, "White noise of each sample of the track speeds."),
     ("--input-bias input_bias_mps", "MPS", float, "Bias of both track speeds."),
     ("--gnss gnss_std_m", "rtk|waas|METRES", gnss_text, "Noise of north and east: rtk 0.01 m, waas 0.30 m."),
     ("--gnss-rate gnss_rate_hz", "HZ", POSITIVE, "Fixes per second."),
 )
-"""Options of `simulate` and `study`: the field of the plan, path or sensors that each sets, metavar, type, help."""
+"""Options of `simulate` and `study`: names, with the field of plan, path or sensors, metavar, type and help."""
 
 DRIVE_DEFAULTS: dict[str, object] = {
     "kind": "curved", "speed_mps": 0.4, "radius_m": 1.5, "leg_m": 10.0, "input_noise_mps": 0.0, "input_bias_mps": 0.0,
     "gnss_std_m": "rtk", "gnss_rate_hz": 20.0,
 }  # fmt: skip
-"""Defaults of `simulate` by field; a study has other defaults."""
+"""Defaults of `simulate` by field. A study has its own defaults."""
 
 DYNAMICS = (
-    flag("--dynamics", "Contacts slide with friction, loads shift, the driver steers: the ICRs follow from forces."),
+    flag("--dynamics", "The robot slides on contacts with friction, and a driver steers: the ICRs result."),
     flag("--tracks", "With --dynamics: five road wheels a side, in place of two wheels."),
     option("--friction", "MU", POSITIVE, "With --dynamics: friction coefficient along the wheels; default 0.7."),
-    option("--friction-std", "SHARE", NOT_NEGATIVE, "With --dynamics: how much friction varies along the path; default "
-           "0.1."),
+    option("--friction-std", "SHARE", NOT_NEGATIVE, "With --dynamics: standard deviation of the friction along the "
+           "path, as a share of it; default 0.1."),
 )  # fmt: skip
 """Options of `simulate` and `study` for a robot on sliding contacts."""
 
@@ -136,20 +145,20 @@ RECORDED = (
      "Content of the wheel messages: counted travel, or the motor commands.", "encoder"),
     ("--wheel-messages", None, click.Choice(get_args(WheelMessages)), "Message type of the wheels.", "joint_states"),
     ("--wheel-rate", "HZ", POSITIVE, "Wheel messages a second; default 100, commanded 10.", None),
-    ("--motor-lag motor_lag_s", "S", NOT_NEGATIVE, "Time constant with which the tracks follow their commands.", 0.0),
+    ("--motor-lag motor_lag_s", "S", NOT_NEGATIVE, "Time constant of the tracks behind their commands [s].", 0.0),
     ("--antenna", "FORWARD,RIGHT", numbers_reader("FORWARD,RIGHT", 2),
      "Position of the antenna, from the body origin [m].", "0,0"),
-    ("--gnss-delay gnss_delay_s", "S", float, "The stamps of the fixes lag by this.", 0.0),
+    ("--gnss-delay gnss_delay_s", "S", float, "Time by which the stamps of the fixes lag [s].", 0.0),
     ("--heading convention", None, click.Choice(get_args(HeadingConvention)),
      "Convention of the Imu: REP-103, or REP-145's NED.", "enu"),
     ("--heading-std heading_std_rad", "DEG", angle_reader(NOT_NEGATIVE), "White noise of the heading.", 1.0),
-    ("--heading-resolution heading_resolution_rad", "DEG", angle_reader(NOT_NEGATIVE), "Headings are rounded to this.",
+    ("--heading-resolution heading_resolution_rad", "DEG", angle_reader(NOT_NEGATIVE), "Step of the rounded headings.",
      0.05),
     ("--heading-rate heading_rate_hz", "HZ", POSITIVE, "Headings a second.", 100.0),
     ("--heading-offset heading_offset_rad", "DEG", angle_reader(), "Added to every heading, clockwise.", 0.0),
-    ("--heading-delay heading_delay_s", "S", float, "The stamps of the headings lag by this.", 0.0),
+    ("--heading-delay heading_delay_s", "S", float, "Time by which the stamps of the headings lag [s].", 0.0),
 )  # fmt: skip
-"""Further options of `simulate`, as in `DRIVE`, with their default."""
+"""Further options of `simulate`, with the columns of `DRIVE` and their default."""
 
 
 def drive_options(*further: Option, **defaults: object) -> Option:
@@ -159,7 +168,7 @@ def drive_options(*further: Option, **defaults: object) -> Option:
     ----------
     defaults : defaults of `DRIVE` by field; other fields have no default
     """
-    text = "The ICRs become these after T seconds; repeatable."
+    text = "New true ICRs [m] from T seconds on; repeatable."
     change = option("--change changes", "T:YR,YL,X", change_text, text, multiple=True)
     of_drive = [option(*row, default=defaults.get(row[0].split()[-1])) for row in DRIVE]
     of_robot = options_as_record("contacts", "icrtool.simulation.friction:FrictionRobot", *DYNAMICS, change=True)
@@ -187,13 +196,13 @@ def simulate_command(
     wheel_messages: WheelMessages, convention: HeadingConvention, contacts: Change[FrictionRobot], dynamics: bool,
     tracks: bool, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
-    """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth next to it.
+    """Drive a robot of known ICRs, and write the log that its sensors would record and the true states.
 
-    The kinematics are the paper's (Eqs. 8-10), integrated without error; the sensors those of its Section 4. The robot
-    is pentzer-tracked unless --robot, --config or --set robot.… name another. LOG.truth.csv holds the true pose (about
-    latitude 40.7934, longitude -77.86), ICRs and track speeds at every wheel stamp.
+    Kinematics (Eqs. 8-10, integrated without error) and sensors (Section 4) are those of Pentzer 2014. The robot is
+    pentzer-tracked, unless --robot, --config or --set robot.… name another one. LOG.truth.csv holds the true pose
+    (about latitude 40.7934, longitude -77.86), ICRs and track speeds at every wheel stamp.
 
-    With --dynamics the robot slides on contacts with friction, and its ICRs are a result of speed, load and ground.
+    With --dynamics the robot slides on contacts with friction, and its ICRs result from speed, load and ground.
 
     \b
     Example:
@@ -218,8 +227,8 @@ def simulate_command(
     if sensed.wheels == "commanded":
         drive = replace(drive, command_rate_hz=rate)
     if log.suffix not in ("", ".mcap", ".bag"):
-        advice = "name an .mcap or .bag file, or for a ROS 2 bag a directory, without a dot"
-        raise errors.ConfigError(log, f"{log.suffix} is not written", advice)
+        advice = "name a file .mcap or .bag, or for a ROS 2 bag a directory without a dot in its name"
+        raise errors.ConfigError(log, f"no log of suffix {log.suffix} can be written", advice)
     writing = write_log.WriteOptions(
         container="mcap" if log.suffix == ".mcap" else "bag" if log.suffix == ".bag" else "db3",
         wheels=wheel_messages,
@@ -244,7 +253,7 @@ def friction_robot(
     """Return the robot on sliding contacts with the configured track width; None without --dynamics."""
     if not dynamics:
         if tracks or contacts(friction.FrictionRobot()) != friction.FrictionRobot():
-            raise click.UsageError("--tracks, --friction and --friction-std belong to --dynamics: give it too")
+            raise click.UsageError("--tracks, --friction and --friction-std need --dynamics")
         return None
     robot = friction.TRACKED_ROBOT if tracks else friction.FrictionRobot()
     width_m = config.robot.track_width_m
@@ -252,21 +261,22 @@ def friction_robot(
 
 
 def default_icrs(config: Config) -> Icrs:
-    """Return the default of the true ICRs, right, left, x [m]."""
+    """Return the default of the true ICRs: y right, y left, x [m]."""
     half = DEFAULT_MULTIPLIER * needed_number(config, "track_width_m") / 2
     return half, -half, 0.0
 
 
 def needed_number(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> float:
-    """Return a number of the robot that a simulation needs; refuse a robot without it."""
+    """Return a configured number of the robot; refuse a robot without it, because a simulation needs it."""
     value: float | None = getattr(config.robot, key)
     if value is None:
         advice = f"--set robot.{key}=…, or --robot NAME"
-        raise errors.ConfigError(f"robot.{key}", "needed to simulate a robot", advice)
+        raise errors.ConfigError(f"robot.{key}", "is not set, and a simulation needs it", advice)
     return value
 
 
 def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> str:
+    """Return the lines that are printed of a simulated drive: robot, path, ICRs."""
     import numpy as np
 
     distance_m = float(np.hypot(np.diff(truth["north_m"]), np.diff(truth["east_m"])).sum())
@@ -289,17 +299,20 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
 @options_as_record(
     "request",
     "icrtool.simulation.study_records:StudyRequest",
-    option("--runs", "N", click.IntRange(min=1), "Runs for each value (in study initial: for each start)."),
+    option("--runs", "N", click.IntRange(min=1), "Number of runs for each value (in study initial: for each start)."),
     options.SEED,
     option(
-        "--values", "V,V,...", numbers_reader("V,V,..."), "Values of the quantity that the study varies, in its unit."
+        "--values",
+        "V,V,...",
+        numbers_reader("V,V,..."),
+        "Values of the quantity that the study varies, in the unit of the quantity.",
     ),
     change=True,
 )
-@choice("--preset", get_args(PresetName), "Study this preset alone; default: both; initial: paper; convergence: paper, "
-        "or field with --robot.")  # fmt: skip
+@choice("--preset", get_args(PresetName), "Study this preset alone; default: both, but paper in study initial, and in "
+        "study convergence paper, or field with --robot.")  # fmt: skip
 @drive_options(
-    choice("--wheels", ("ideal", "encoder"), "Wheel speeds without error, or counted travel."),
+    choice("--wheels", ("ideal", "encoder"), "ideal: wheel speeds without error; encoder: counted travel."),
     option("--rate", "HZ", click.FloatRange(min=1, max=200), "Wheel and heading samples per second."),
     option("--heading-std heading_std_rad", "DEG", angle_reader(POSITIVE), "White noise of the heading."),
 )
@@ -312,7 +325,7 @@ def study_command(
     contacts: Change[FrictionRobot], dynamics: bool, tracks: bool, rate: float | None, plots: tuple[str, ...],
     settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
-    """Simulate and filter many drives, and report accuracy, convergence time and consistency of the ICRs.
+    """Simulate and filter many drives; report accuracy, convergence time and consistency of the ICRs.
 
     \b
     NAME is one of
@@ -328,8 +341,8 @@ def study_command(
       rate                        whether logs of any rate give the same ICRs
       consistency                 whether the filter's covariance is right
 
-    Defaults are those of the paper (Pentzer 2014, Section 5); --robot and the options replace them. DIR holds
-    study.json, every run in NAME.csv, and the picture.
+    The defaults are those of Pentzer 2014, Section 5; --robot and the options replace them. DIR gets study.json,
+    NAME.csv with every run, and the picture.
 
     \b
     Example:
@@ -368,14 +381,15 @@ def study_command(
 
 
 def check_varied(study: Study, name: str, arguments: Mapping[str, object]) -> None:
-    """Refuse an option for a quantity that the study varies, and values for a study that varies no number.
+    """Refuse an option for the quantity that a study varies, and values for a study that varies no number.
 
     Parameters
     ----------
-    arguments : the options by name
+    study, name : the study and its name
+    arguments : values of the options by name
     """
     if arguments.get(study.varied) is not None:
         option = next(parameter.opts[0] for parameter in study_command.params if parameter.name == study.varied)
-        raise click.UsageError(f"{option} is what study {name} varies; --values V,V,... sets where")
+        raise click.UsageError(f"study {name} varies {option}; --values V,V,... sets its values")
     if arguments["values"] is not None and not study.varies:
-        raise click.UsageError(f"study {name} varies no number; it takes no --values")
+        raise click.UsageError(f"study {name} varies no number, and has no --values")

@@ -83,7 +83,7 @@ def test_too_little_memory_is_one_line(kilobytes: int) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         assert done.returncode == 1, done.stderr
-        assert error_of(done.stderr).startswith("Error: memory: there is not enough")
+        assert error_of(done.stderr).startswith("Error: memory: the process has reached its limit")
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])

@@ -206,7 +206,7 @@ def test_report_and_batch_have_the_row_of_a_calibration_that_a_dropout_report_ha
     assert calibration_rows(run) == expected
     status, _, errors = icrtool("report", other.name, *asked[1 + len(ROBOT) :])
     assert status == 1
-    assert "is no log and no run" in errors
+    assert "is neither a log nor a run" in errors
 
 
 @pytest.mark.parametrize("command", [("dropout-report",), ("report",), ("batch", "-o", "results")])

@@ -122,7 +122,7 @@ def test_a_bag_directory_is_replaced_when_forced(tmp_path: Path) -> None:
         (("--icrs", "-0.5,0.5,0"), "icrs: y_icr_right -0.5 is not right of y_icr_left 0.5; y is positive to the right"),
         (("--path", "lawnmower", "--radius", "0"), "radius: a lawnmower path has no bends of radius 0"),
         (("--duration", "0.01"), "duration: 0.01 s holds fewer than two samples"),
-        (("--set", "robot.track_width_m=0.5"), "robot.wheel_radius_m: needed to simulate a robot"),
+        (("--set", "robot.track_width_m=0.5"), "robot.wheel_radius_m: is not set, and a simulation needs it"),
         (("--robot", "tank"), "robot 'tank': not a built-in robot"),
         (("--speeds", "nothing.csv"), "nothing.csv: cannot be read; No such file or directory"),
         (("--change", "9:0.5,-0.5,0", "--change", "3:0.4,-0.4,0"), "change: the times 9, 3 do not increase"),
@@ -137,7 +137,9 @@ def test_what_cannot_be_simulated_is_said_in_one_line(refused, tmp_path: Path, a
 
 
 def test_a_bare_db3_is_refused(refused) -> None:
-    assert refused("-o", "a.db3")[1].startswith("Error: a.db3: .db3 is not written; name an .mcap or .bag file")
+    assert refused("-o", "a.db3")[1].startswith(
+        "Error: a.db3: no log of suffix .db3 can be written; name a file .mcap or .bag"
+    )
 
 
 def test_a_folder_that_is_not_there_is_said(refused) -> None:
@@ -183,11 +185,11 @@ def test_quiet_prints_nothing_and_verbose_says_more(tmp_path: Path) -> None:
 def test_a_change_after_the_end_and_a_time_that_is_none_are_wrong_usage(icrtool) -> None:
     status, _, err = icrtool("simulate", "-o", "a.mcap", "--duration", "20", "--change", "40:1,-1,0")
     assert status == 2
-    assert "--change: no change at 40 s: the drive lasts 20 s" in err
+    assert "--change: 40 s is after the end of the drive, which lasts 20 s" in err
     short = ("study", "icr-change", "--duration", "100", "--runs", "1")
     status, _, err = icrtool(*short, "--change", "175:1,-1,0")
     assert status == 2
-    assert "--change: no change at 175 s: the drive lasts 100 s" in err
+    assert "--change: 175 s is after the end of the drive, which lasts 100 s" in err
     status, _, err = icrtool(*short)
     assert status == 1
     assert err.startswith("Error: duration: 100 s end before the first change, at 175 s; drive longer")

@@ -84,9 +84,9 @@ def test_quiet_prints_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("gnss", "--gnss", "waas"), "--gnss is what study gnss varies; --values V,V,... sets where"),
-        (("rate", "--rate", "50"), "--rate is what study rate varies"),
-        (("consistency", "--values", "1"), "study consistency varies no number; it takes no --values"),
+        (("gnss", "--gnss", "waas"), "study gnss varies --gnss; --values V,V,... sets its values"),
+        (("rate", "--rate", "50"), "study rate varies --rate"),
+        (("consistency", "--values", "1"), "study consistency varies no number, and has no --values"),
         (("nonsense",), "'nonsense' is not one of 'convergence'"),
         (("rate", "--values", "fast"), "'fast' is not of the form V,V,..."),
         (("rate", "--plots", "gif"), "'gif' is not one of png, svg, pdf, none"),

@@ -1,8 +1,9 @@
 """Files and directories that appear whole or not at all, and replace nothing that icrtool did not write.
 
-Each is written and synced under a hidden name in the folder of its place (``.icrtool-…``), then renamed. A new
-directory exchanges its name with the old one. Where this is not possible, the old directory is renamed to a hidden name
-first. If a process is killed between both renames, the next process that writes there renames the old directory back.
+A result is written and synced under a hidden name (``.icrtool-…``) in its folder, and then renamed to its place. A new
+directory exchanges its name with the old one. Where the system cannot exchange two names in one step, the old directory
+is renamed to a hidden name first. If a process is killed between the two renames, the next process that writes there
+renames the old directory back.
 """
 
 from __future__ import annotations
@@ -28,36 +29,38 @@ from icrtool.records.places import Below, Place, open_regular, path_of
 from icrtool.records.process_resources import mark_finished, mark_unfinished, remove_path, unfinished
 
 MayReplace = Callable[[bytes], bool]
-"""Whether icrtool wrote a file and may replace it, by the first bytes of the file."""
+"""Function that states, by the first bytes of a file, whether icrtool wrote the file and may replace it."""
 
 EXPORTED_MCAP = b"icrtool export"
-"""Library in the header of an MCAP file that `icrtool export` wrote. It shows that the file is not a user's log."""
+"""Name of the library in the header of an MCAP file that `icrtool export` wrote: the file is no log of a user."""
 
 PACKED_BEGINNINGS = (b"\x28\xb5\x2f\xfd", b"\x1f\x8b", b"BZh", b"\x04\x22\x4d\x18")
-"""First bytes of files packed with zstd, gzip, bzip2 and lz4. icrtool writes no such file, and it may be a log."""
+"""First bytes of files packed with zstd, gzip, bzip2 and lz4. icrtool writes no packed file: it may be a user's log."""
 
 RECOGNISED_BYTES = 4096
+"""Number of bytes that are read from the begin of a file to recognise it."""
 
 HIDDEN = ".icrtool-"
-"""Begin of the names of icrtool's files that are not results."""
+"""First characters of the names of files that icrtool uses while it writes results."""
 
 FILE_MANAGER_FILES = {".DS_Store", "Thumbs.db", "desktop.ini"}
 """Names of files that file managers write into the folders they show."""
 
 PARTIAL_SUFFIX, OLD_SUFFIX = ".partial", ".old"
-"""Suffixes of hidden names: of files and directories being written, and of old directories."""
+"""Suffixes of hidden names: the first is of files and directories being written, the second of old directories."""
 
 ABANDONED_S = 3600.0
-"""Time without a change after which no process writes a hidden file any more [s]. A report takes minutes."""
+"""Time without a change after which a hidden file counts as abandoned [s]. A report takes minutes."""
 
 NO_SYNC = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
+"""Error numbers of file systems that cannot sync a directory."""
 
 SYNC_THREADS = 8
-"""Number of threads that sync files. A journal commits simultaneous requests together: eight threads sync 16 files in a
-fifth of the time of one thread."""
+"""Number of threads that sync files. A file system commits simultaneous requests together: eight threads sync 16 files
+in a fifth of the time of one thread."""
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
-"""Constants of Linux, from <fcntl.h> and <linux/fs.h>."""
+"""Arguments of the system call renameat2 of Linux, from <fcntl.h> and <linux/fs.h>."""
 
 
 class DirectoryKind(NamedTuple):
@@ -65,8 +68,8 @@ class DirectoryKind(NamedTuple):
 
     Attributes
     ----------
-    name : for messages ("run directory")
-    recognises : whether a directory is one
+    name : words for messages, for example "run directory"
+    recognises : states whether a directory is of this kind
     files : matches the names of all files and directories that icrtool writes below it; a directory ends in ``/``
     """
 
@@ -89,13 +92,14 @@ def check_place(file: Place, ours: MayReplace | None = None) -> None:
 
     Parameters
     ----------
+    file : the place of the file
     ours : as in `atomic_file`
 
     Raises
     ------
     OutputError
-        The directory is missing, or is a link below the folder; a log, a directory, a device, a pipe or a file that
-        icrtool did not write is there.
+        The directory of the file is missing, or is a link below the folder of the place; or a log, a directory, a
+        device, a pipe or a file that icrtool did not write is in this place.
     """
     with place_errors(file):
         if not _target_of(file, ours).parent.is_dir():
@@ -130,18 +134,24 @@ def _target_of(file: Place, ours: MayReplace | None) -> Path:
 
 @contextmanager
 def atomic_file(file: Place, ours: MayReplace | None = None) -> Iterator[Path]:
-    """Give a hidden path in the folder of a file to write to; at the block's end it is synced and moved to its place.
+    """Yield a hidden path to write a file to; when the block ends without error, the file is renamed to its place.
 
     Parameters
     ----------
-    file : where it shall appear; a log is never replaced. Below a folder, a link in its place is replaced; where the
-        user named the file, the link is kept and its target is replaced
-    ours : which files may be replaced; default: any file that is not a log
+    file : place of the file; a log is never replaced. If the place is below a folder, a link there is replaced; if the
+        user named the path, the link is kept and its target is replaced
+    ours : states which files may be replaced; default: any file that is not a log
+
+    Yields
+    ------
+    Path
+        An empty file in the folder of `file`.
 
     Raises
     ------
     OutputError
-        As `check_place`, and for every OSError of the block (disk full, no permission). The old file is then unchanged.
+        `check_place` refuses the place, or the block raised an OSError (disk full, no permission). The old file is then
+        unchanged.
     """
     with place_errors(file), partial_at(_target_of(file, ours), Path.touch) as partial:
         yield partial
@@ -150,16 +160,17 @@ def atomic_file(file: Place, ours: MayReplace | None = None) -> Iterator[Path]:
 
 
 def write_file(file: Place, content: str | bytes, ours: MayReplace | None = None) -> None:
-    """Write a file, whole or not at all; a text is written in UTF-8, with escapes for invalid characters.
+    """Write a file, whole or not at all.
 
     Parameters
     ----------
-    ours : as in `atomic_file`
+    file, ours : as in `atomic_file`
+    content : bytes, or a text, which is written in UTF-8; characters that UTF-8 cannot hold become escapes
 
     Raises
     ------
     OutputError
-        As `atomic_file`.
+        `check_place` refuses the place, or the file cannot be written.
     """
     with atomic_file(file, ours) as partial:
         partial.write_bytes(content.encode("utf-8", errors="backslashreplace") if isinstance(content, str) else content)
@@ -171,7 +182,7 @@ def make_folders(folder: Below) -> None:
     Raises
     ------
     OutputError
-        A link or a file is in its place, or it cannot be made.
+        A link or a file is in the place of a folder, or a folder cannot be made.
     """
     with place_errors(folder):
         folder.check_links()
@@ -183,13 +194,15 @@ def check_directory(directory: Place, kind: DirectoryKind) -> None:
 
     Parameters
     ----------
-    directory : where it shall appear; only an empty directory, or one of the kind without other files, may be there
+    directory : place of the directory; an empty directory may be there, or a directory of the kind that holds no other
+        files
+    kind : kind of the directory
 
     Raises
     ------
     OutputError
-        A file, a directory of another kind, or a file that icrtool did not write is there; the old directory could not
-        be removed; it is a mount point; or the place cannot be examined.
+        The place is a file, a directory of another kind, a directory with a file that icrtool did not write, a
+        write-protected directory or a mount point; or it cannot be examined.
     """
     why, advice = "", "it is left alone; name another place"
     with place_errors(directory):
@@ -230,14 +243,14 @@ def names_in(directory: Path) -> Iterator[str]:
     Raises
     ------
     OSError
-        A directory cannot be read. It may then hold any file.
+        A directory cannot be read, and may hold any file.
     """
 
-    def unseen(err: OSError) -> None:
+    def raise_unread(err: OSError) -> None:
         if not isinstance(err, FileNotFoundError):
             raise err
 
-    for place, folders, files in os.walk(directory, onerror=unseen):
+    for place, folders, files in os.walk(directory, onerror=raise_unread):
         # Hidden files of another process may disappear at any moment.
         folders[:] = [name for name in folders if not name.startswith(HIDDEN)]
         for name in (*folders, *files):
@@ -249,7 +262,7 @@ def names_in(directory: Path) -> Iterator[str]:
 
 @contextmanager
 def atomic_directory(directory: Place, kind: DirectoryKind) -> Iterator[Path]:
-    """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
+    """Yield a hidden directory to write into; rename it to its place if the block ends without error, else remove it.
 
     Parameters
     ----------
@@ -263,7 +276,7 @@ def atomic_directory(directory: Place, kind: DirectoryKind) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        As `check_directory`, and for every OSError of the block (disk full, no permission).
+        `check_directory` refuses the place, or the block raised an OSError (disk full, no permission).
     """
     check_directory(directory, kind)
     place = Path(os.path.realpath(path_of(directory)))
@@ -278,9 +291,9 @@ def atomic_directory(directory: Place, kind: DirectoryKind) -> Iterator[Path]:
 
 @contextmanager
 def partial_at(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
-    """Make a file or directory under a hidden name in the folder of a place, and remove_path this name at the end.
+    """Make a file or directory under a hidden name in the folder of a place, yield its path, and remove it at the end.
 
-    Hidden files that killed processes abandoned there are removed too.
+    Hidden files that killed processes left there are removed too.
     """
     for abandoned in list(place.parent.glob(_hidden_name(place, "*-*-*"))):
         # An old directory under a hidden name is kept as long as nothing is in its place.
@@ -297,23 +310,23 @@ def partial_at(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
 
 
 def _hidden_name(place: Path, writer: str, suffix: str = "") -> str:
-    """Return a hidden name for a place; its length does not depend on the name of the place."""
+    """Return a hidden name for a place; the length of the hidden name does not depend on the name of the place."""
     return f"{HIDDEN}{blake2b(os.fsencode(place.name), digest_size=8).hexdigest()}-{writer}{suffix}"
 
 
 def writer_id() -> str:
-    """Return host and process of this command, with random letters: for a hidden name, or a claim to an address."""
+    """Return a text with host, process and random letters that identifies this command in hidden names and claims."""
     return f"{crc32(platform.node().encode()):08x}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def _has_no_writer(path: Path) -> bool:
-    """Return whether no process writes a hidden file: its process has ended, or it is `ABANDONED_S` old."""
+    """Return whether no process writes a hidden file any more: its process has ended, or it is `ABANDONED_S` old."""
     return not may_still_write("-".join(path.name.split("-")[-3:])) or path.lstat().st_mtime < time.time() - ABANDONED_S
 
 
-def may_still_write(stated: str) -> bool:
-    """Return whether the process that `writer` states may still write; True where that cannot be known."""
-    host, _, rest = stated.partition("-")
+def may_still_write(writer: str) -> bool:
+    """Return whether the process in a `writer_id` may still write; True where that cannot be known."""
+    host, _, rest = writer.partition("-")
     number = rest.partition("-")[0]
     if sys.platform != "linux" or not writer_id().startswith(f"{host}-") or not number.isdecimal():
         return True
@@ -321,14 +334,14 @@ def may_still_write(stated: str) -> bool:
 
 
 def put_in_place(partial: Path, place: Path) -> None:
-    """Put a synced hidden file or directory in its place; `partial_at` removes the old one.
+    """Rename a synced hidden file or directory to its place; `partial_at` removes the old one.
 
     Raises
     ------
     OSError
         It cannot be renamed. The old file or directory is then unchanged.
     """
-    # If this process is killed, the old directory must not be removed under its hidden name.
+    # The old directory gets this hidden name. If this process is killed now, the old directory must not be removed.
     mark_finished(partial)
     if not place.is_dir():
         partial.replace(place)
@@ -348,7 +361,7 @@ def put_in_place(partial: Path, place: Path) -> None:
 
 
 def _exchange(first: Path, other: Path) -> bool:
-    """Give two directories each other's names in one step, and return whether that was possible here."""
+    """Exchange the names of two directories in one step; return whether the system could do so."""
     if sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "renameat2"):
         return False
     names = AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(other)
@@ -356,7 +369,7 @@ def _exchange(first: Path, other: Path) -> bool:
 
 
 def sync(path: Path) -> None:
-    """Have the system write a file's content, or a directory's names, to the disk."""
+    """Sync a file, or the names in a directory, to the disk."""
     if sys.platform == "win32" and path.is_dir():
         return
     # Windows syncs only files that are open for writing.
@@ -364,7 +377,7 @@ def sync(path: Path) -> None:
     try:
         os.fsync(handle)
     except OSError as err:
-        # Some network file systems have no sync for directories; a file whose sync fails is not written.
+        # Some network file systems cannot sync directories. A file whose sync fails may be lost, so this is an error.
         if err.errno not in NO_SYNC or not path.is_dir():
             raise
     finally:

@@ -1,6 +1,6 @@
-"""Formats of icrtool's files: JSON, CSV, pictures, and the list of their sums, which shows an edited file.
+"""Formats of icrtool's files: JSON, CSV, pictures, and the list of their checksums, which shows an edited file.
 
-The module also reads and writes documents of one JSON file: calibrations, and the fleet.json of a batch.
+The module also reads and writes calibrations, and reads the fleet.json of a batch.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def schema_of(file: Place) -> str:
-    """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty where it states none."""
+    """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty if the file states none."""
     try:
         schema = json.loads(read_regular(file))["schema"]
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
@@ -49,46 +49,49 @@ def parse_json(raw: bytes) -> Any:  # noqa: ANN401 - whatever JSON holds
     Raises
     ------
     ValueError, RecursionError
-        It is no JSON, or holds a number that is not finite, which `json_bytes` never writes.
+        The bytes are not JSON, or hold a number that is not finite, which `json_bytes` never writes.
     """
     return json.loads(raw, parse_constant=_finite, parse_float=_finite)
 
 
 def _finite(text: str) -> float:
+    """Return the number in a text; refuse infinity and NaN."""
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text} is no number")
+        raise ValueError(f"{text} is not a finite number")
     return value
 
 
 Document = TypeVar("Document", bound=msgspec.Struct)
 
 
-def read_document(file: Place, kind: type[Document], *, escape: bool = True) -> Document:
-    """Read a JSON file as a record: types and limits are checked, keys that it does not know are ignored.
+def read_document(file: Place, record_type: type[Document], *, escape: bool = True) -> Document:
+    """Return the content of a JSON file as a record. Types and limits are checked; keys without a field are ignored.
 
     Parameters
     ----------
+    file : place of the file
+    record_type : type of the record
     escape : escape the texts, because they are printed later; names of files are not escaped
 
     Raises
     ------
     OSError, ValueError, RecursionError
-        The file cannot be read, or does not agree with the record.
+        The file cannot be read, or its content does not fit the record.
     """
     stored = parse_json(read_regular(file))
-    return msgspec.convert(escaped_texts(stored) if escape else stored, kind)
+    return msgspec.convert(escaped_texts(stored) if escape else stored, record_type)
 
 
 def json_bytes(document: msgspec.Struct | Mapping[str, object]) -> bytes:
-    """Return the JSON text of a file: indented, UTF-8, null for a number that is not finite."""
+    """Return a document as JSON: indented, in UTF-8, with null for a number that is not finite."""
     text = json.dumps(_as_in_the_log(plain_value(document)), indent=2, ensure_ascii=False, allow_nan=False)
     # A file name with lone surrogates, which UTF-8 cannot hold, is written with JSON escapes.
     return (text + "\n").encode("utf-8", errors="backslashreplace")
 
 
 def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return plain data with the texts of a log unescaped: JSON has escapes of its own."""
+    """Return plain data with the texts of a log unescaped, because JSON has escapes of its own."""
     if isinstance(value, dict):
         return {key: _as_in_the_log(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -97,7 +100,7 @@ def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
 
 
 def csv_bytes(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes:
-    """Return a table as CSV: numbers in their shortest exact form, an empty cell for None, text as `table_cell`."""
+    """Return a table as CSV: numbers in their shortest exact form, empty cells for None, infinity and NaN."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -106,6 +109,7 @@ def csv_bytes(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes
 
 
 def _cell(value: object) -> object:
+    """Return the content of a cell of CSV."""
     if isinstance(value, str):
         return table_cell(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -114,12 +118,18 @@ def _cell(value: object) -> object:
 def read_numbers(
     path: Path, needed: Sequence[str], optional: Sequence[str] = (), *, most_bytes: int | None = None
 ) -> dict[str, Floats]:
-    """Read columns of numbers (n,) by name; an empty cell is NaN, other columns are ignored.
+    """Return columns (n,) of a CSV file by name; an empty cell is NaN.
+
+    Parameters
+    ----------
+    path : path of the file
+    needed, optional : names of the columns to read; all others are ignored
+    most_bytes : largest size of the file [bytes]; None: any
 
     Raises
     ------
     DataError
-        The file cannot be read, is larger than `most_bytes`, lacks a column that is needed, or has fewer than two rows.
+        The file cannot be read, is larger than `most_bytes`, lacks a column of `needed`, or has fewer than two rows.
     """
     try:
         with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig", newline="") as file:
@@ -141,55 +151,59 @@ def read_numbers(
 
 
 PLOT_FORMATS = ("png", "svg", "pdf")
+"""Formats of pictures, which are also the suffixes of their files."""
 
 
 def check_picture(file: Path) -> None:
-    """Refuse a place or a format that cannot be written, before any work is done for it.
+    """Refuse a picture whose place or format cannot be written, before any work is done for it.
 
     Raises
     ------
     OutputError
-        Another suffix than png, svg, pdf, or no such folder.
+        The suffix is none of `PLOT_FORMATS`, or `check_place` refuses the place.
     """
     if file.suffix.removeprefix(".").lower() not in PLOT_FORMATS:
-        raise OutputError(file, "its suffix is no format of a picture", f"end it in .{', .'.join(PLOT_FORMATS)}")
+        raise OutputError(
+            file, "its suffix is not the suffix of a picture", f"end the name in .{', .'.join(PLOT_FORMATS)}"
+        )
     check_place(file)
 
 
 def save_picture(figure: Figure, file: Place) -> None:
-    """Write a figure; the suffix gives the format.
+    """Write a figure in the format of the suffix of the file.
 
     Raises
     ------
     OutputError
         The file cannot be written.
     """
-    form = path_of(file).suffix.removeprefix(".").lower()
+    picture_format = path_of(file).suffix.removeprefix(".").lower()
     from icrtool.output.figures.style import picture_bytes
 
-    write_file(file, picture_bytes(figure, form))
+    write_file(file, picture_bytes(figure, picture_format))
 
 
 CHECKSUM_FILE = "B2SUMS"
-"""File in a run with the sums of the run's files, in the form that ``b2sum --check`` reads.
+"""Name of the file in a run with the checksums of the run's files, in the form that ``b2sum --check`` reads.
 
-It lists every file of the run and of its dropout report, but not the page. The list is correct at every moment: while a
-report is replaced, the list does not name its files.
+The file lists every file of the run and of its dropout report, but not the page. It is correct at every moment: while a
+report is replaced, it does not name the files of the report.
 """
 
 LARGEST_SUMS_BYTES = 1 << 20
-"""Largest size of the list of sums of a run [bytes]. The list of a run has some 40 lines of 160 bytes."""
+"""Largest size of the list of checksums of a run [bytes]. Such a list has some 40 lines of 160 bytes."""
 
 SOURCES_FILE = ".icrtool-files"
-"""File in a run with the absolute paths of the files that the run was made from. run.json holds the paths as given."""
+"""Name of the file in a run with the absolute paths of its input files. run.json holds the paths as the user gave
+them."""
 
 LARGEST_RUN_FILE_BYTES = 1 << 33
-"""Largest size of a file of a run [bytes]: 70 h at 100 Hz. A sparse file may state a far larger size, and would take
-hours to read."""
+"""Largest size of a file of a run [bytes]: 70 h at 100 Hz. A sparse file may state a far larger size and take hours to
+read."""
 
 
 def file_b2sum(place: Place) -> str:
-    """Return the BLAKE2b sum (hex) of a file: as safe as SHA-256, at twice its speed on most machines.
+    """Return the BLAKE2b checksum (hex) of a file. BLAKE2b is as safe as SHA-256, and twice as fast on most machines.
 
     Raises
     ------
@@ -203,12 +217,12 @@ def file_b2sum(place: Place) -> str:
 
 
 def read_sums(directory: Path) -> dict[str, str]:
-    """Return the BLAKE2b sums (hex) of the files of a run, by their path below it.
+    """Return the BLAKE2b checksums (hex) of the files of a run, by the path of each file below the run.
 
     Raises
     ------
     RunError
-        The list of sums cannot be read.
+        The list of checksums cannot be read.
     """
     try:
         lines = read_regular(Below(directory, CHECKSUM_FILE), LARGEST_SUMS_BYTES).decode().splitlines()
@@ -218,24 +232,34 @@ def read_sums(directory: Path) -> dict[str, str]:
 
 
 def write_sums(directory: Path, sums: Mapping[str, str]) -> None:
-    """Write the list of a run.
+    """Write the list of checksums of a run.
 
     Raises
     ------
     OutputError
-        The disk does not take it.
+        The list cannot be written.
     """
     lines = (f"{sum_}  {name}\n" for name, sum_ in sums.items())
     write_file(Below(directory, CHECKSUM_FILE), "".join(lines))
 
 
 def relist_files(directory: Path, part: str, names: Iterable[str] = ()) -> None:
-    """Replace the files of a part of a run in the run's list; a directory without a list gets none.
+    """Replace the files of one directory of a run in the run's list of checksums; a run without a list gets none.
 
     Parameters
     ----------
-    part : a directory of the run; all its entries in the list are removed
-    names : its files, relative to it, which are added; none: while the part is being replaced
+    directory : the run
+    part : name of the directory in the run; all its files are removed from the list
+    names : files that are added to the list, relative to `part`; empty while the files are being replaced
+
+    Raises
+    ------
+    OSError
+        A file cannot be read.
+    OutputError
+        The list cannot be written.
+    RunError
+        The list cannot be read.
     """
     if not os.path.lexists(directory / CHECKSUM_FILE):
         return
@@ -247,19 +271,20 @@ def relist_files(directory: Path, part: str, names: Iterable[str] = ()) -> None:
 
 
 CALIBRATION_FILE = "calibration.json"
+"""Name of a calibration file in a folder."""
 
 
 def open_calibration(file: Path | str) -> Calibration:
-    """Read a calibration file.
+    """Return the calibration in a file.
 
     Parameters
     ----------
-    file : a file that ``icrtool calibrate -o`` or `Calibration.write` wrote
+    file : path of a file that ``icrtool calibrate -o`` or `Calibration.write` wrote
 
     Raises
     ------
     RunError
-        It cannot be read, or is not a calibration.
+        The file cannot be read, or is not a calibration.
     """
     from icrtool.calibration.record import Calibration
 
@@ -274,17 +299,17 @@ def open_calibration(file: Path | str) -> Calibration:
 
 
 def write_calibration(document: CalibrationFile, place: Place) -> Path:
-    """Write a calibration file: into `place` where that is a folder, else as `place`.
+    """Write a calibration file to a place, or into the place if it is a folder.
 
     Returns
     -------
     Path
-        The file.
+        The path of the file.
 
     Raises
     ------
     OutputError
-        Something that is not a calibration is there, or it cannot be written.
+        `calibration_file` refuses the place, or the file cannot be written.
     """
     file = calibration_file(place)
     write_file(file, json_bytes(document))
@@ -292,12 +317,12 @@ def write_calibration(document: CalibrationFile, place: Place) -> Path:
 
 
 def calibration_file(place: Place) -> Place:
-    """Return where the calibration file is written for `place`: in this folder, else `place` itself.
+    """Return the place of a calibration file: `place` itself, or `CALIBRATION_FILE` in it if it is a folder.
 
     Raises
     ------
     OutputError
-        Its folder does not exist, or something that is not a calibration is there.
+        The folder does not exist, or a file that is not a calibration is there.
     """
     target = Below(path_of(place), CALIBRATION_FILE) if path_of(place).is_dir() else place
     file = path_of(target)
@@ -310,12 +335,12 @@ def calibration_file(place: Place) -> Place:
 
 
 def read_fleet(directory: Path) -> FleetDocument:
-    """Return the content of a batch's fleet.json.
+    """Return the content of the fleet.json of a batch.
 
     Raises
     ------
     OSError, ValueError, RecursionError
-        It cannot be read, or is not of this version.
+        The file cannot be read, or another version wrote it.
     """
     return read_document(Below(directory, FLEET_FILE), FleetDocument, escape=False)
 
@@ -326,7 +351,7 @@ def logs_of_fleet(directory: Path) -> list[FleetLog]:
     Raises
     ------
     RunError
-        The folder does not hold the result of a batch.
+        The folder has no readable fleet.json, or the run of a log is a link.
     """
     try:
         usable = [log for log in read_fleet(directory).logs if log.status != "failed"]

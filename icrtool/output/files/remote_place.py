@@ -1,8 +1,9 @@
-"""Results at an address: made in a temporary folder, then uploaded; the files that make results valid come last.
+"""Results at an address: they are made in a temporary folder and then uploaded.
 
-Of several commands that upload to one address at the same time, the first one claims it; the others change nothing.
+The files without which results are not valid are uploaded last. Of several commands that upload to one address at the
+same time, the first one claims the address; the others change nothing there.
 
-Only this module writes over a connection. All others write to a folder on disk, which `folder_on_disk` gives them.
+Only this module writes over a connection. All other modules write to a folder on disk (`folder_on_disk`).
 """
 
 from __future__ import annotations
@@ -28,27 +29,31 @@ from icrtool.records.places import Below, UrlPath
 Result = TypeVar("Result")
 
 VALIDITY_FILES = (CHECKSUM_FILE, FLEET_FILE)
-"""Files without which a run or a batch is not valid. They are removed before anything is replaced, and uploaded
-last."""
+"""Names of the files without which a run or a batch is not valid. They are removed before any other file is replaced,
+and uploaded last."""
 
 MOST_REQUESTS = 8
 """Largest number of requests at the same time."""
 
 _PROBE, _CLAIM = ".icrtool-upload", ".icrtool-writer"
-"""Names of two files. The first is written and removed before any work, to test the place. The second states which
-command uploads results, and since when; it exists during the upload, in which no other command changes the place."""
+"""Names of two files at an address. `_PROBE` is written and removed before any work is done, to test that the address
+can be written. `_CLAIM` exists during an upload and states the command that uploads: no other command then changes the
+address."""
 
 CLAIM_CHECKED_S = 60.0
-"""Time after which a command looks again whether the claim is still its own [s], before it uploads a further file."""
+"""Time after which a command reads the claim again before it uploads a further file [s]. The claim must still be its
+own."""
 
 _LONGEST_CLAIM = 200
+"""Number of bytes of a claim that are read. icrtool writes about 40."""
 
 Needed = Callable[[str], bool]
-"""Whether the content of a file is needed, by its name below the place. Of other files only the name is needed."""
+"""Function that states, by the name of a file below a place, whether the content of the file is needed, or only its
+name."""
 
 
 def is_document(name: str) -> bool:
-    """Return whether a file describes results: it states what a folder holds and whether that may be replaced."""
+    """Return whether a file states what a folder of results holds and whether the folder may be replaced."""
     is_ours = name.endswith((".json", ".html", ".png")) or PurePosixPath(name).name in {SOURCES_FILE, CHECKSUM_FILE}
     return is_ours and not name.startswith("runs/")
 
@@ -62,15 +67,20 @@ def folder_on_disk(
     *,
     writes: bool = True,
 ) -> Iterator[Path]:
-    """Give a folder on disk for a place of results; at the end, upload its changes if the place is an address.
+    """Yield a folder on disk with the results at a place; at the end, upload its changes if the place is an address.
 
     Parameters
     ----------
-    place : a folder on disk, which is given itself, or an address
-    needed : whether the content of a file is fetched; a file at the address that is not needed is empty on disk
-    parts : folders below an address that are listed, in addition to its own files; None: all
-    begin : called before the upload
-    writes : whether the address is written; otherwise it is only read
+    place : a folder on disk, which is yielded itself, or an address
+    needed : states which files are fetched; every other file at the address becomes an empty file on disk
+    parts : names of the folders below an address that are listed, in addition to its own files; None: all folders
+    begin : called with the name of the stage before the upload
+    writes : whether changes are uploaded; otherwise the address is only read
+
+    Yields
+    ------
+    Path
+        The folder on disk. If `place` is an address, the folder is removed at the end.
 
     Raises
     ------
@@ -82,7 +92,7 @@ def folder_on_disk(
         return
     store = _Store(place, "written" if writes else "read")
     if writes:
-        # A place that cannot be written is refused before any work is done for it.
+        # An address that cannot be written is refused before any work is done for it.
         store.put(b"icrtool", _PROBE)
         store.remove([_PROBE])
     scratch = ScratchFolder()
@@ -98,7 +108,7 @@ def folder_on_disk(
         texts = [str(err.what), err.why, err.advice]
         if not any(str(folder) in text for text in texts):
             raise
-        # Errors name the address.
+        # The temporary folder is replaced by the address, because the user knows only the address.
         raise type(err)(*(text.replace(str(folder), str(place)) for text in texts)) from err
     finally:
         scratch.close()
@@ -110,7 +120,7 @@ def write_below(folder: Path, name: str, content: bytes) -> None:
     Raises
     ------
     OutputError
-        It cannot be written.
+        The file cannot be written.
     """
     file = folder / name
     if isinstance(file, UrlPath):
@@ -121,7 +131,7 @@ def write_below(folder: Path, name: str, content: bytes) -> None:
 
 
 def has_file(place: UrlPath, name: str) -> bool:
-    """Return whether an object store has a file of this name below an address."""
+    """Return whether there is a file of this name below an address in an object store; False on a web server."""
     if place.scheme.startswith("http"):
         return False
     files, path = filesystem(place / name)
@@ -129,10 +139,21 @@ def has_file(place: UrlPath, name: str) -> bool:
 
 
 class _Store:
-    """A folder, or a file, at an address that is written."""
+    """A folder or a file in an object store.
+
+    Parameters
+    ----------
+    place : its address
+    done : participle for messages of errors, for example "written"
+
+    Raises
+    ------
+    OutputError
+        The address is on a web server, or its scheme cannot be used.
+    """
 
     def __init__(self, place: UrlPath, done: str = "written") -> None:
-        self._what_is_done = done
+        self._participle = done
         if place.scheme.startswith("http"):
             raise OutputError(place, "results are not written to a web server", "name a folder, or s3://, gs://, az://")
         self._place = place
@@ -143,21 +164,21 @@ class _Store:
         self._checked_s = 0.0
 
     def put(self, content: bytes, name: str = "") -> None:
-        """Write a file."""
+        """Write a file of this name below the address, or at the address itself."""
         self._ask(lambda: self._files.pipe_file(self._address_of(name), content))
 
     def fetch(self, folder: Path, needed: Needed, parts: Collection[str] | None) -> dict[str, tuple[int, int]]:
-        """Copy the address to the folder on disk.
+        """Copy the files at the address to a folder on disk; a file that is not `needed` becomes an empty file.
 
         Returns
         -------
         dict of str to (int, int)
-            Numbers that identify the content of the files, by their names.
+            Two numbers by name of the file, which change if the file on disk changes.
         """
         names = []
         self._found = self._validity_facts()
         for name in self._list_files(parts):
-            # Anybody may have written the name: it must be the name of a file below the folder.
+            # A stranger may have written the name, so a name that leads out of the folder is left out.
             path = PurePosixPath(name)
             below = name and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
             if below and name not in {_PROBE, _CLAIM}:
@@ -172,7 +193,7 @@ class _Store:
         return {name: _identity(folder / name) for name in names}
 
     def upload(self, folder: Path, before: dict[str, tuple[int, int]]) -> None:
-        """Copy the folder on disk to the address."""
+        """Copy the changes of a folder on disk to the address; `before` is the result of `fetch`."""
         files_now = [path for path in folder.rglob("*") if path.is_file() and path.stat().st_size]
         now = {path.relative_to(folder).as_posix(): _identity(path) for path in files_now}
         gone = [name for name in before if not (folder / name).exists()]
@@ -187,33 +208,34 @@ class _Store:
             last = [name for name in VALIDITY_FILES if name in now]
             self.remove([name for name in VALIDITY_FILES if name in before])
             self.remove([name for name in gone if name not in VALIDITY_FILES])
-            # The first files, run.json among them, show that the rest of an interrupted upload is icrtool's.
+            # If the upload is interrupted, run.json shows that the other files there are icrtool's.
             first = [name for name in changed if name.endswith(".json") and name not in last]
             for names in (first, [name for name in changed if name not in {*first, *last}], last):
                 self._check_claim(claim)
                 self._ask_for_each(partial(self._put_file, folder, claim), names)
         finally:
-            # Without a connection it stays, and the next command of this host sees that its process is gone.
+            # If the connection is lost, the claim stays. The next command on this host finds that its process has
+            # ended.
             with suppress(IcrToolError):
                 self._check_claim(claim)
                 self.remove([_CLAIM])
 
     def _put_file(self, folder: Path, claim: bytes, name: str) -> None:
-        """Copy a file of the folder to the address."""
+        """Copy one file of a folder on disk to the address; check the claim from time to time."""
         if time.time() > self._checked_s + CLAIM_CHECKED_S:
             self._check_claim(claim)
         self._files.put_file(str(folder / name), self._address_of(name))
 
     def _take_claim(self) -> bytes:
-        """Write a claim to the place, where there is none of a living command, and return it.
+        """Write a claim to the address, unless another command that still runs has written one; return the claim.
 
-        The store itself sees to it that of several commands only one can write the claim: all others end before they
+        The object store lets only one of several commands write the claim. The other commands end before they have
         changed anything.
 
         Raises
         ------
         OutputError
-            Another command writes there.
+            Another command is writing there.
         """
         claim = f"{writer_id()} {time.time():.0f}".encode()
         if not self._write_claim(claim):
@@ -226,12 +248,12 @@ class _Store:
             self.remove([_CLAIM])
             if not self._write_claim(claim):
                 self._raise_claimed()
-        # A store that writes the second claim over the first one gives it to both.
+        # A store without conditional writes lets the second command replace the first claim.
         self._check_claim(claim)
         return claim
 
     def _write_claim(self, claim: bytes) -> bool:
-        """Write the claim where no other is there; return whether it was written."""
+        """Write the claim if there is none; return whether it was written."""
 
         def write(**options: str) -> int:
             try:
@@ -245,11 +267,11 @@ class _Store:
             return 0
 
         answer = self._ask(lambda: write(mode="create"))
-        # Some stores know no conditional writes.
+        # Some stores have no conditional writes.
         return not (self._ask(write) if answer == errno.ENOSYS else answer)
 
     def _read_claim(self) -> bytes:
-        """Return the claim at the place; empty where there is none."""
+        """Return the claim at the address; empty if there is none."""
 
         def ask() -> bytes:
             self._files.invalidate_cache()
@@ -261,24 +283,25 @@ class _Store:
         return self._ask(ask)
 
     def _check_claim(self, claim: bytes) -> None:
-        """Refuse to continue where another command claimed the place at the same time."""
+        """Refuse to continue if another command claimed the address at the same time."""
         if self._read_claim() != claim:
             self._raise_claimed()
         self._checked_s = time.time()
 
     def _raise_claimed(self) -> NoReturn:
+        """Raise the error that another command has claimed the address."""
         why = "another command began to write there at the same time"
         raise OutputError(self._place, why, "its results stay; run this command again")
 
     def _validity_facts(self) -> list[object]:
-        """Return the store's facts about the files without which results are not valid."""
+        """Return size and version of each of `VALIDITY_FILES`; None for a file that does not exist."""
         return [
             (about.get("size"), version_of(about)) if (about := self._facts_of(name)) else None
             for name in VALIDITY_FILES
         ]
 
     def _facts_of(self, name: str) -> dict[str, Any]:
-        """Return the store's present facts about a file; empty where there is none."""
+        """Return the facts that the store states about a file now; empty if there is no such file."""
 
         def ask() -> dict[str, Any]:
             self._files.invalidate_cache()
@@ -291,7 +314,7 @@ class _Store:
         return self._ask(ask)
 
     def _list_files(self, parts: Collection[str] | None) -> list[str]:
-        """Return the files below the address."""
+        """Return the names of the files below the address; `parts` as in `folder_on_disk`."""
         self._files.invalidate_cache()
         if parts is None:
             names = self._ask(lambda: self._files.find(self._name))
@@ -303,6 +326,7 @@ class _Store:
         return [name.removeprefix(f"{self._name}/") for name in names]
 
     def _list_top_files(self) -> list[str]:
+        """Return the names of the files at the address, without its folders."""
         # `find` with a depth lists all files at az://, and ignores errors at s3://.
         try:
             entries = self._files.ls(self._name, detail=True)
@@ -311,47 +335,49 @@ class _Store:
         return [entry["name"] for entry in entries if entry["type"] == "file"]
 
     def _address_of(self, name: str) -> str:
+        """Return the address of a file of this name, as the object store takes it."""
         return f"{self._name}/{name}" if name else self._name
 
     def remove(self, names: list[str]) -> None:
-        """Remove files."""
+        """Remove the files of these names."""
         self._ask_for_each(lambda name: self._files.rm_file(self._address_of(name)), names)
 
     def _ask_for_each(self, request: Callable[[str], object], names: Iterable[str]) -> None:
-        """Make a request for each file, several at the same time."""
+        """Call `request` with the name of each file, several at the same time."""
         with ThreadPoolExecutor(MOST_REQUESTS) as pool:
             list(pool.map(lambda name: self._ask(lambda: request(name)), names))
 
     def _ask(self, request: Callable[[], Result]) -> Result:
-        """Return the answer to a request."""
+        """Return the answer of the store to a request; raise its errors as OutputError."""
         with place_errors(self._place), _as_output(self._place):
-            return ask_server(self._place, request, done=self._what_is_done)
+            return ask_server(self._place, request, done=self._participle)
 
 
 @contextmanager
 def _as_output(place: UrlPath) -> Iterator[None]:
-    """Raise an error of a connection as one of a place of results."""
+    """Raise a LogError of the block as an OutputError of a place."""
     try:
         yield
     except LogError as err:
         why = "cannot be written" if err.why == "no such file" else err.why
-        raise OutputError(place, why, err.advice or "is there such a bucket?") from err
+        raise OutputError(place, why, err.advice or "check that the bucket exists") from err
 
 
 def _time_of(claim: bytes) -> float:
-    """Return when a claim was written [s of the epoch]; 0 where it does not state this."""
+    """Return the time at which a claim was written [s since 1970]; 0 if the claim does not state it."""
     stated = claim.rpartition(b" ")[2]
     return float(stated) if stated.isdigit() and len(stated) < 15 else 0.0
 
 
 def _is_abandoned(claim: bytes) -> bool:
-    """Return whether the command that wrote a claim is gone: its process has ended, or it wrote an hour ago."""
-    stated = claim.partition(b" ")[0].decode("ascii", "replace")
-    # A process writes to a place once at a time: its own claim is left from a broken connection.
-    is_own = stated.rpartition("-")[0] == writer_id().rpartition("-")[0]
-    return is_own or not may_still_write(stated) or _time_of(claim) < time.time() - ABANDONED_S
+    """Return whether no command holds a claim any more: its process has ended, or it was written an hour ago."""
+    writer = claim.partition(b" ")[0].decode("ascii", "replace")
+    # A process uploads to one address at a time, so a claim of this process is left from a broken connection.
+    is_own = writer.rpartition("-")[0] == writer_id().rpartition("-")[0]
+    return is_own or not may_still_write(writer) or _time_of(claim) < time.time() - ABANDONED_S
 
 
 def _identity(file: Path) -> tuple[int, int]:
+    """Return two numbers of a file on disk that change if it is replaced or written to."""
     status = file.stat()
     return status.st_ino, status.st_mtime_ns

@@ -1,8 +1,8 @@
-"""The columns of a run as files: its states and smoothed states, and its measurements with their outcomes.
+"""The columns of a run as files: states, smoothed states, and measurements with their outcomes.
 
-States are exact CSV, or Parquet. ``measurements.npz`` holds the sensors as the filter used them, and the outcome of
-each measurement. Of the wheel samples it holds only the samples before the first recorded state, since the others are
-columns of the states.
+States are written as exact CSV or as Parquet. ``measurements.npz`` holds the measurements as the filter used them, and
+the outcome of each. It holds only the wheel samples before the first recorded state, because the other wheel samples
+are columns of the states.
 """
 
 from __future__ import annotations
@@ -39,20 +39,25 @@ if TYPE_CHECKING:
 
 
 COLUMNS_OF_STATES = tuple(field.name for field in fields(States))
+"""Names of the columns of states, in the order of the files."""
+
 INTEGER_COLUMNS = frozenset({"stamp_ns"})
+"""Names of the int64 columns of states; the others are float64."""
+
 FLOAT_COLUMNS = tuple(name for name in COLUMNS_OF_STATES if name not in INTEGER_COLUMNS)
 DEVIATIONS = frozenset(f"std_{name}" for name in STATE_COLUMNS)
+"""Names of the columns with standard deviations."""
 
 FORMATTED_ROWS = 1024
-"""Number of rows formatted at a time. Their text stays in the processor's cache, and memory does not grow with the
-log."""
+"""Number of rows that are formatted at a time. Their text fits into the processor's cache, and memory does not grow
+with the log."""
 
 PARQUET_ROWS = 1 << 17
-"""Number of rows of a row group. A group is held in memory until it is written."""
+"""Number of rows in a row group of a Parquet file. A group is held in memory until it is written."""
 
 FREE_STATES_BYTES = 1 << 29
-"""Memory that states may always have [bytes]. Beyond it they may have `LARGEST_RATIO` times the size of their file, as
-the states of a robot that is parked for hours have."""
+"""Memory that states from a file may have in any case [bytes], in addition to `LARGEST_RATIO` times the size of the
+file. The states of a robot that is parked for hours compress by a large ratio."""
 
 
 def write_states(table: States, path: Path, states: StatesFormat) -> None:
@@ -61,8 +66,8 @@ def write_states(table: States, path: Path, states: StatesFormat) -> None:
     Parameters
     ----------
     table : the recorded states
-    path : the file to make
-    states : its format
+    path : path of the new file
+    states : format of the file
 
     Raises
     ------
@@ -98,11 +103,14 @@ def write_states(table: States, path: Path, states: StatesFormat) -> None:
 
 
 def read_states(place: Place, states: StatesFormat, *, whole: bool = True) -> States:
-    """Read states that `write_states` wrote.
+    """Return the states in a file that `write_states` wrote.
 
     Parameters
     ----------
-    whole : hold the standard deviations, too; otherwise, with Parquet, they are read where they are used
+    place : place of the file
+    states : format of the file
+    whole : hold all columns in memory; otherwise the standard deviations in a Parquet file are read each time they are
+        used
 
     Raises
     ------
@@ -121,7 +129,7 @@ def read_states(place: Place, states: StatesFormat, *, whole: bool = True) -> St
             with open_regular(place) as source, pq.ParquetFile(source) as file:
                 numbers = file.metadata.num_rows * len(COLUMNS_OF_STATES)
                 if 8 * numbers > FREE_STATES_BYTES + LARGEST_RATIO * os.fstat(source.fileno()).st_size:
-                    raise ValueError(f"it claims {numbers} numbers, too many for its size")
+                    raise ValueError(f"it claims {numbers} numbers, more than a file of its size can hold")
                 _check_columns(file.schema_arrow, types)
                 held = {
                     name: _parquet_column(file, name) for name in COLUMNS_OF_STATES if whole or name not in DEVIATIONS
@@ -144,7 +152,13 @@ def read_states(place: Place, states: StatesFormat, *, whole: bool = True) -> St
 
 
 class StoredStates(States):
-    """States whose standard deviations stay in the file, and are read each time they are used."""
+    """States whose standard deviations stay in the file and are read each time they are used.
+
+    Parameters
+    ----------
+    read : returns the standard deviations (n,) of a column by its name
+    held : the other columns (n,)
+    """
 
     __slots__ = ("_held", "_read")
     _read: Callable[[str], Floats]
@@ -157,7 +171,7 @@ class StoredStates(States):
         object.__setattr__(self, "_held", held)
 
     def __getattr__(self, name: str) -> Floats:
-        # Called for columns that are not held.
+        # Python calls this method only for columns that are not held in memory.
         if name not in DEVIATIONS:
             raise AttributeError(name)
         return self._read(name)
@@ -166,23 +180,23 @@ class StoredStates(States):
         return States, tuple(self.columns().values())
 
     def changed(self, **columns: Floats | Ints) -> States:
-        """Return the states with some other columns."""
+        """Return the states with the given columns in place of their own."""
         return StoredStates(self._read, **(self._held | columns))
 
 
 def _identity(file: BufferedReader) -> tuple[int, ...]:
-    """Return facts of a file that change if it is replaced or written to."""
+    """Return numbers of an open file that change if the file is replaced or written to."""
     status = os.fstat(file.fileno())
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _read_again(place: Place, identity: tuple[int, ...], name: str) -> Floats:
-    """Return a column of states that were read before.
+    """Return a column (n,) from a file of states that was opened before.
 
     Raises
     ------
     RunError
-        The file is no longer the one that was read.
+        The file was replaced, edited or removed since.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -199,7 +213,7 @@ def _read_again(place: Place, identity: tuple[int, ...], name: str) -> Floats:
 
 
 def _parquet_column(file: pq.ParquetFile, name: str) -> NDArray[Any]:
-    """Return a column without nulls, read group by group, so that it needs no more memory than the column."""
+    """Return a column (n,) without nulls; it is read group by group, which needs no further memory."""
     column = np.empty(file.metadata.num_rows, np.int64 if name in INTEGER_COLUMNS else np.float64)
     filled = 0
     for group in range(file.num_row_groups):
@@ -212,19 +226,23 @@ def _parquet_column(file: pq.ParquetFile, name: str) -> NDArray[Any]:
 
 
 def _check_columns(schema: pa.Schema, types: dict[str, pa.DataType]) -> None:
-    columns = [(name, kind) for name, kind in zip(schema.names, schema.types, strict=True) if name in types]
+    """Refuse a file whose columns are not the columns of states."""
+    columns = [
+        (name, column_type) for name, column_type in zip(schema.names, schema.types, strict=True) if name in types
+    ]
     if sorted(name for name, _ in columns) != sorted(types) or dict(columns) != types:
         raise ValueError("its columns are not the columns of states")
 
 
 def _array(column: pa.ChunkedArray) -> NDArray[Any]:
-    """Return a column without nulls as an array; pyarrow's own conversion would import pandas."""
+    """Return a column without nulls as an array (n,); pyarrow's own conversion would import pandas."""
     if column.null_count:
         raise ValueError("a cell is empty")
     return np.concatenate([np.from_dlpack(chunk) for chunk in column.chunks])
 
 
 def _csv_chunks(table: States) -> Iterator[bytes]:
+    """Yield the bytes of a CSV file with the states, `FORMATTED_ROWS` rows at a time."""
     yield (",".join(COLUMNS_OF_STATES) + "\n").encode()
     columns = table.columns()
     for begin in range(0, len(table), FORMATTED_ROWS):
@@ -232,17 +250,21 @@ def _csv_chunks(table: States) -> Iterator[bytes]:
         stamps = np.ascontiguousarray(table.stamp_ns[rows])
         numbers = np.stack([columns[name][rows] for name in FLOAT_COLUMNS], 1, dtype=np.float64)
         if np.isfinite(numbers).all():
-            # Finding one byte is faster than finding the three between rows; the first two bytes of a row are skipped.
+            # Rows are split at one byte, which is faster than at the three bytes between rows. Therefore the first two
+            # bytes of each row are removed.
             texts = [row[2:] for row in orjson.dumps(numbers, option=orjson.OPT_SERIALIZE_NUMPY).split(b"]")[:-2]]
-        else:  # JSON cannot express a number that is not finite
+        else:
+            # JSON cannot express a number that is not finite.
             texts = [",".join(map(repr, row)).encode() for row in numbers.tolist()]
         stamp_texts = orjson.dumps(stamps, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].split(b",")
         yield b"\n".join([*map(b",".join, zip(stamp_texts, texts, strict=True)), b""])
 
 
 MEASUREMENTS_FILE = "measurements.npz"
+"""Name of the file with the measurements of a run."""
 
 OUTCOME_COLUMNS = ("nis", "code", "difference")
+"""Columns of the outcome of fixes and headings (`MeasurementOutcome`)."""
 
 COLUMN_TYPES = {
     "stamp_ns": np.int64,
@@ -251,15 +273,15 @@ COLUMN_TYPES = {
     "down_weighted": np.bool_,
     "code": np.uint8,
 }
-"""Types of the columns that are not float64."""
+"""Types of the columns of measurements that are not float64, by name."""
 
 
 WHEEL_COLUMNS = ("stamp_ns", "v_left_mps", "v_right_mps")
-"""Columns that are stored for wheel samples before the first state. The states hold the other samples."""
+"""Columns of the wheel samples before the first state. The states hold the other wheel samples."""
 
 
 def write_measurements(run: Run, path: Path) -> None:
-    """Write the measurements of a run as arrays that `numpy.load` reads.
+    """Write the measurements of a run to a new file, as arrays that `numpy.load` reads.
 
     Raises
     ------
@@ -286,26 +308,32 @@ def write_measurements(run: Run, path: Path) -> None:
 def read_measurements(
     directory: Path, table: States, document: RunDocument
 ) -> tuple[States, SensorData, MeasurementOutcome, MeasurementOutcome]:
-    """Read measurements that `write_measurements` wrote: the sensors, and the outcome of fixes and headings.
-
-    The wheel columns of the returned states share the memory of the wheel samples.
+    """Return the measurements of a run, from the file that `write_measurements` wrote.
 
     Parameters
     ----------
-    directory : of the run
-    table : the states of the run; `document`: its run.json, which holds the facts that are no columns
+    directory : the run
+    table : the states of the run
+    document : content of run.json, which holds the facts that are not columns
+
+    Returns
+    -------
+    states : the states of the run; their wheel columns share the memory of the wheel samples
+    sensors : wheels, fixes, headings and gyro
+    fixes, headings : outcome of each fix and of each heading in the filter
 
     Raises
     ------
     ValueError
-        It is no such file, or its columns do not belong together.
+        The file is not a file of measurements, or its columns do not belong together.
     OSError
         The file cannot be read.
     """
     try:
         with open_regular(Below(directory, MEASUREMENTS_FILE)) as file, ZipFile(file) as stored:
             if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
-                raise ValueError(f"{MEASUREMENTS_FILE} is compressed")  # its size would have no bound
+                # The size of a compressed array has no bound.
+                raise ValueError(f"{MEASUREMENTS_FILE} is compressed")
             columns = {}
             for member in stored.infolist():
                 with stored.open(member) as array:
@@ -331,7 +359,7 @@ def read_measurements(
             gyro=gyro,
             facts=document.facts,
             losses_ns=spans_of(document.rtk_losses_ns),
-            # Columns include seconds, which the records of the log do not have.
+            # The documents also have seconds; the records of the log have stamps alone.
             events=msgspec.convert(document.events, tuple[SlipEvent, ...], from_attributes=True),
             jumps=msgspec.convert(document.reference_jumps, tuple[ReferenceJump, ...], from_attributes=True),
             attitude=attitude,
@@ -350,16 +378,17 @@ def read_measurements(
 
 
 def spans_of(pairs: object) -> Ints:
-    """Return the spans of a run.json as an array (k, 2) [ns]."""
+    """Return the spans in a run.json as an array (k, 2) of begins and ends [ns]."""
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
 def _names(record: type) -> tuple[str, ...]:
+    """Return the names of the fields of a dataclass."""
     return tuple(field.name for field in fields(record))
 
 
 def _columns(columns: dict[str, NDArray[Any]], group: str, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Return the columns of a group, all of one length and of their types."""
+    """Return the columns (n,) of a group by name; refuse columns of other types or of different lengths."""
     by_name = {name: _checked(columns, f"{group}_{name}", name) for name in names}
     if len({len(column) for column in by_name.values()}) > 1:
         raise ValueError(f"the columns of the {group} differ in length")
@@ -367,9 +396,10 @@ def _columns(columns: dict[str, NDArray[Any]], group: str, names: tuple[str, ...
 
 
 def _checked(columns: dict[str, NDArray[Any]], key: str, name: str) -> NDArray[Any]:
-    column, kind = columns[key], COLUMN_TYPES.get(name, np.float64)
-    if column.ndim != 1 or column.dtype != kind:
-        raise ValueError(f"{key} is no column of {np.dtype(kind)}")
-    if kind is np.float64 and name not in OUTCOME_COLUMNS and (np.abs(column) > LARGEST_STATE).any():
+    """Return a column (n,); refuse another type, another shape, or numbers beyond `LARGEST_STATE`."""
+    column, column_type = columns[key], COLUMN_TYPES.get(name, np.float64)
+    if column.ndim != 1 or column.dtype != column_type:
+        raise ValueError(f"{key} is not a column of {np.dtype(column_type)}")
+    if column_type is np.float64 and name not in OUTCOME_COLUMNS and (np.abs(column) > LARGEST_STATE).any():
         raise ValueError(f"{key} holds a number beyond {LARGEST_STATE:g}")
     return column

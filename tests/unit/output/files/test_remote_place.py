@@ -23,7 +23,7 @@ from icrtool import pipeline
 from icrtool.cli import main
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files import remote_place
-from icrtool.output.files.atomic import writer
+from icrtool.output.files.atomic import writer_id
 from icrtool.output.files.remote_place import folder_on_disk
 from icrtool.records.places import UrlPath
 from support.batches import in_this_process
@@ -206,7 +206,7 @@ def test_where_an_address_is_not_taken_it_is_refused_without_its_secrets(monkeyp
     place = f"s3://key:{SECRET}@field/one.json"
     status, said = run(monkeypatch, capfd, *(place if one == "PLACE" else one for one in arguments))
     assert status == 2
-    assert "s3://field/one.json: an address is not taken here" in said
+    assert "s3://field/one.json: is an address; name a place on disk" in said
     assert not list(tmp_path.iterdir())
 
 
@@ -369,7 +369,7 @@ def test_a_command_that_writes_while_another_uploads_changes_nothing_and_the_run
 
 
 def test_a_claim_of_a_living_command_is_named_and_one_of_a_dead_command_is_replaced(store, monkeypatch, capfd, mcap):
-    here = writer().partition("-")[0]
+    here = writer_id().partition("-")[0]
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     now = int(time.time())
