@@ -1,9 +1,9 @@
-"""The numbers that the script of a run's page draws: the drive, decimated, and the path of each model through it.
+"""Data for the scripts of the page of a run: the decimated drive, and the path of each model through it.
 
-Time series keep the smallest and the largest value of each interval. With constant parameters the page computes one
-path of the drive, and turns and shifts it to the start of a trial. ICRs that differ by start have no such path: the
-page integrates the wheel speeds with the ICRs of the start. Up to `MOST_PAGE_STEPS` samples are not thinned, so the
-path ends where the library's path does.
+Time series keep the smallest and the largest value of each interval. A model with constant parameters has one path of
+the whole drive, which a script turns and shifts to the start of a trial. Momentary ICRs have no such path: the script
+integrates the wheel speeds with the ICRs of the start. Up to `MOST_PAGE_STEPS` wheel samples are kept, so that the
+script's path ends where the library's path ends.
 """
 
 from __future__ import annotations
@@ -47,36 +47,38 @@ from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, Run, track_of, 
 from icrtool.records.run_document import IcrColumn
 
 MOST_PAGE_STEPS = 150_000
-"""Largest number of wheel samples of a page. If there are more, each fixed number of samples is joined to one."""
+"""Largest number of wheel samples of a page. Of a longer drive, equal numbers of samples are joined to one."""
 
 PATH_POINTS = 200_000
-"""Largest number of points of all models' paths together. If there are more, the paths are thinned evenly."""
+"""Largest number of points of the paths of all models together. Beyond it, paths are thinned evenly."""
 
 SERIES_POINTS = 16_000
-"""Number of rows of the time series: some ten per pixel column, so that a tenth of the drive still shows its
-extremes."""
+"""Number of rows of the time series: about ten for each column of pixels, so that a view of a tenth of the drive still
+shows all extremes."""
 
 FIX_POINTS = 8_000
+"""Largest number of used, and of rejected, fixes of a page."""
 
 ERROR_KEYS = {"p95": "p95_m", "p95_low": "p95_low_m", "p95_high": "p95_high_m", "expected": "expected_error_m",
               "expected_low": "expected_low_m", "expected_high": "expected_high_m"}  # fmt: skip
+"""Fields of `ErrorRow` by the keys that the scripts read."""
 
 
 def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[str, object]:
-    """Return plain data for the page of a run.
+    """Return the data of the page of a run, by the keys that the scripts read.
 
     Parameters
     ----------
-    run : its states are the reference of the trials in `report`
+    run : run whose states are the reference of the trials in `report`
     report : content of report.json
-    coordinates : whether the axes of the map count from the datum; otherwise from the first state
+    coordinates : count the axes of the map from the datum; otherwise from the first state
     """
     table = run.table
     rows, joined = every_so_many(len(table), MOST_PAGE_STEPS)
     north, east = float(table.north_m[0]), float(table.east_m[0])
     origin = (float(round(north)), float(round(east))) if coordinates else (north, east)
     half = None if run.track_width_m is None else run.track_width_m / 2
-    # The scale covers the same numbers of each ICR as its figure, and the ICRs without slip.
+    # The scale covers the same numbers of each ICR as the figure, and the ICRs without slip.
     shown = [] if half is None else [half, -half]
     for icr in (getattr(table, name) for name in ICR_COLUMNS):
         shown += [*percentiles(icr, RANGE_PERCENT), float(icr[0]), float(icr[-1])]
@@ -99,7 +101,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
 
 
 def errors_data(report: DropoutDocument) -> dict[str, object]:
-    """Return the errors over distance by model, and the errors of the reference alone."""
+    """Return the errors over distance of each model, and the errors of the reference alone."""
     models = in_row_order(report.models)
     rows = rows_of(model.name for model in models)
     shown_names = shown_rows(list(rows))
@@ -117,12 +119,18 @@ def errors_data(report: DropoutDocument) -> dict[str, object]:
 
 
 def row_look(row: Row) -> dict[str, object]:
-    """Return how the scripts of a page draw a row; the colour is a name of page.css, the width in pixels."""
+    """Return colour (a name in page.css), dash and width [pixels] with which the scripts draw a row."""
     return {"color": row.color, "dash": row.dash, "width": 2.0 * row.width}
 
 
 def _steps_data(run: Run, rows: Ints, origin: tuple[float, float]) -> dict[str, object]:
-    """Return wheel speeds and reference pose at every step."""
+    """Return travel of the sides, distance and reference position at every step, gaps, and steps without reference.
+
+    Parameters
+    ----------
+    rows : rows of the states at the steps
+    origin : north and east of the origin of the map [m]
+    """
     track = track_of(run)
     columns = {
         "left": track.cumulate(track.v_left)[rows],
@@ -141,7 +149,7 @@ def _steps_data(run: Run, rows: Ints, origin: tuple[float, float]) -> dict[str, 
 
 
 def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
-    """Return the states that the time series show; each is a step too."""
+    """Return the states that the time series show, at some of the steps."""
     table = run.table
     icrs: dict[str, IcrColumn] = {"y_right": "y_icr_right_m", "y_left": "y_icr_left_m", "x": "x_icr_m"}
     values = {name: getattr(table, column)[steps] for name, column in icrs.items()}
@@ -159,7 +167,7 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
 
 
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
-    """Return place, time and distance from the filter of the used and of the rejected fixes."""
+    """Return place, time and distance from the filter of used and of rejected fixes; `origin` as in `_steps_data`."""
     fixes, difference = run.sensors.fixes, run.gnss.difference
     data: dict[str, object] = {"top_m": scale_end_m(difference[run.gnss.used])}
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
@@ -170,7 +178,10 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
 
 
 def _differences(outcome: MeasurementOutcome, chosen: Bools, difference: Floats) -> tuple[Ints, dict[str, object]]:
-    """Return the rows of the chosen measurements, the extremes of many; their differences, and where a line breaks."""
+    """Return rows of the chosen measurements, and their times, differences and line breaks.
+
+    Of many measurements, the extremes are returned.
+    """
     rows = np.flatnonzero(chosen)
     t_s = outcome.t_s
     used_s = t_s[rows]
@@ -182,17 +193,19 @@ def _differences(outcome: MeasurementOutcome, chosen: Bools, difference: Floats)
 
 
 Paths = Iterator[tuple[str, tuple[Floats, Complexes]]]
-"""Name of a model; heading [rad] and place [m] of the robot along its path, at the steps of the page alone."""
+"""Name of a model, and heading [rad] and place [m] of the robot on its path at the steps of the page."""
 
 
 def _models_data(
     run: Run, report: DropoutDocument, steps: Ints, joined: int, origin: tuple[float, float]
 ) -> dict[str, object]:
-    """Return the models of the report, and the path of each model with constant parameters from the drive's start.
+    """Return the models of the report, and the path of each model with constant parameters from the first state.
 
     Parameters
     ----------
-    steps, joined : rows of the states, and the number of samples from one row to the next
+    steps : rows of the states at the steps of the page
+    joined : number of wheel samples from one step to the next
+    origin : north and east of the origin of the map [m]
     """
     recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(run.track_width_m)))
     paths = {
@@ -236,7 +249,7 @@ def _odometry(run: Run, every: int, origin: tuple[float, float]) -> Paths:
 
 
 def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Paths:
-    """Yield the path of each held-out model of the report, with its parameters fitted to the whole drive."""
+    """Yield the path of each held-out model of the report, with parameters that are fitted to the whole drive."""
     ladder = report.ladder
     if ladder.fits is UNSET:
         return
@@ -249,7 +262,7 @@ def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument,
         if recording.track.gyro is not None:
             fits[f"{model}_{kind}"] = replace(_fitted(f"{base}_gyro", ladder.fits), wheels=wheels[base])
         for name, fit in fits.items():
-            # A drive too short to find the delay of its wheels has no path.
+            # A drive that is too short to find the delay of the wheels has no path.
             with suppress(DataError):
                 constants = own_constants(windows(), fit, recording.width_m)
                 fitted = controller_model(fit, recording.lever, recording.width_m) if model == CONTROLLER else fit
@@ -257,14 +270,14 @@ def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument,
 
 
 def _fitted(name: str, fits: Mapping[str, FitDocument]) -> FittedModel:
-    """Return a model as it was fitted to the whole drive."""
+    """Return the model of this name that was fitted to the whole drive."""
     model, value = find_model(name), fits[name].value
     k = len(model.terms)
     return FittedModel(model, np.array([value[term] for term in model.terms]), np.zeros((k, k)))
 
 
 def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Paths:
-    """Yield the path of each calibration that was given; with the gyro too where there is one."""
+    """Yield the path of each calibration of the report, without and with a gyro."""
     recording = recording_of("gyro") if report.calibrations else None
     for used in report.calibrations:
         turned, document = used.with_gyro, used.calibration
@@ -274,7 +287,7 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
                     stored_calibration(document), recording, used.name, with_gyro=turned,
                     refit_sensors=report.request.refit_sensors,
                 )  # fmt: skip
-                # one path for all starts: with the bias of the gyro as known at the end
+                # The path has the last bias of the gyro, because there is one path for all starts.
                 last_learned = tested.drive.learned[-1]
                 yield (
                     used.name,
@@ -283,7 +296,7 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
 
 
 LARGEST_STEP = 32_000
-"""Number of units of the largest step: the range of 16 bits less a margin for rounding."""
+"""Largest step, in units: the range of 16 bits less a margin for rounding."""
 
 SMALLEST_UNIT = 1e-7
 """Smallest unit of steps [m or rad]. Finer steps have no meaning."""
@@ -295,8 +308,9 @@ class Column(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     type : ``f32``: the numbers; ``levels``: numbers in multiples of a unit; ``sums``: steps in multiples of a unit
-    data : base64 of little-endian float32 or int16
-    first : number at which the steps begin
+    data : base64 of little-endian float32 (``f32``) or int16
+    unit : the unit of levels and of steps
+    first : first number, to which the steps are added
     """
 
     type: Literal["f32", "levels", "sums"]
@@ -306,23 +320,23 @@ class Column(Record, frozen=True, kw_only=True):
 
 
 def pack_column(column: Floats) -> Column:
-    """Return a column (n,) for a page.
+    """Return a column (n,) for a page as float32.
 
     Notes
     -----
-    ``f32`` has seven digits: enough for metres within some kilometres of the origin, and for seconds of a day (8 ms).
+    Seven digits are enough for metres within some kilometres of the origin, and for seconds of a day (8 ms).
     """
     return Column(type="f32", data=_base64(column, "<f4"))
 
 
 def packed_levels(column: Floats) -> Column:
-    """Return a column (n,) without NaN for a page, in 16 bits each: in steps of the greatest value / `LARGEST_STEP`."""
+    """Return a column (n,) without NaN for a page, in 16 bits: multiples of the largest size over `LARGEST_STEP`."""
     unit = max(float(np.abs(column).max(initial=0.0)) / LARGEST_STEP, SMALLEST_UNIT)
     return Column(type="levels", data=_base64(np.rint(column / unit), "<i2"), unit=unit)
 
 
 def packed_sums(column: Floats | Ints, unit: float | None = None) -> Column:
-    """Return a running sum (n,) for a page: its first number, and steps of 16 bits each in multiples of `unit`.
+    """Return a running sum (n,) for a page: its first number, and its steps in 16 bits, in multiples of `unit`.
 
     Notes
     -----
@@ -335,5 +349,6 @@ def packed_sums(column: Floats | Ints, unit: float | None = None) -> Column:
     return Column(type="sums", data=_base64(steps, "<i2"), unit=unit, first=float(column[0]))
 
 
-def _base64(column: NDArray[Any], kind: str) -> str:
-    return b64encode(column.astype(kind).tobytes()).decode("ascii")
+def _base64(column: NDArray[Any], number_type: str) -> str:
+    """Return a column as numbers of a type of NumPy, in base64."""
+    return b64encode(column.astype(number_type).tobytes()).decode("ascii")

@@ -1,4 +1,4 @@
-"""The pages: ``report.html`` of a run, of a batch with links to the pages of its logs, and of a comparison."""
+"""Pages in HTML: of a run, of a batch with links to the pages of its logs, of a comparison and of a calibration."""
 
 from __future__ import annotations
 
@@ -67,8 +67,11 @@ from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text
 
 VENDOR = ("vendor/uPlot.iife.min.js", "vendor/d3-subset.min.js")
+"""Scripts of other projects, in ``static``."""
+
 COPY = "copy.js"
 SCRIPTS = (*VENDOR, "columns.js", "open_loop.js", "charts.js", "map.js", "run.js", COPY)
+"""Scripts of the page of a run, in the order in which they run. `COPY` copies a text to the clipboard."""
 
 
 def write_page(
@@ -78,11 +81,11 @@ def write_page(
 
     Parameters
     ----------
-    run : of `icrtool.fit` or `icrtool.open_run`
-    report : of `icrtool.dropout_report`
-    path : the file; below a folder, only a page is replaced
-    plots : directory of the run, whose PNG pictures the page shows where no script draws; default: `run.directory`
-    coordinates : False leaves out where on the globe the robot was
+    run : result of `icrtool.fit` or `icrtool.open_run`
+    report : result of `icrtool.dropout_report`
+    path : place of the file. If it is below a folder, only a page is replaced
+    plots : run directory whose PNG pictures the page shows where no script draws; default: `run.directory`
+    coordinates : False leaves out the place of the robot on the globe
 
     Raises
     ------
@@ -102,12 +105,12 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     Parameters
     ----------
     run, coordinates : as in `write_page`
-    report : what report.json holds
+    report : content of report.json
     pictures : pictures by name; the page shows them where no script draws
     """
     summary, report_document = run.document, report
     if not coordinates:
-        # Without the datum, coordinates relative to it do not show the place.
+        # Coordinates relative to a datum do not show the place, once the datum is left out. Metric ones may show it.
         metric = summary.gnss.datum is None
         pictures = {name: picture for name, picture in pictures.items() if not (metric and picture.with_place)}
         summary, report_document = without_place(run, report)
@@ -124,7 +127,9 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     )
     provenance = [("log", f"{file.path}: {file.bytes:,} bytes, sha256 {file.sha256}") for file in summary.inputs]
     made_from = Section("Provenance", [Facts([*provenance, ("place", place), ("made with", made_with)])], PAGE)
-    about = "From it icrtool learned how the robot slips, and tested how far wheel speeds alone keep the position."
+    about = (
+        "From this drive icrtool learned how the robot slips, and tested how far wheel speeds alone keep the position."
+    )
     if not with_verdict(summary, report_document).usable:
         about = "How the robot slips when it turns could not be learned from this drive."
     rows = rows_of(model.name for model in report.models)
@@ -146,7 +151,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
 
 
 def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
-    """Return the blocks of a run's page: the answer, the drive, the errors, the motion model, the warnings."""
+    """Return the blocks of the page of a run: answer, drive, errors, motion model, limits, warnings."""
     summary = with_verdict(summary, report)
     rows = [
         (
@@ -175,14 +180,14 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
 
 
 def _cards(summary: RunDocument, report: DropoutDocument) -> list[Section]:
-    """Return the answer as cards, the drive from above in the last one."""
+    """Return the answer as cards; the last card has the drive from above."""
     cards = []
     for section in answer_sections(summary, report):
         blocks = [
             block._replace(caption="") if isinstance(block, Table) and block.caption == section.title else block
             for block in section.blocks
         ]
-        # The checks below it are the reasons for care; only a change of ground is not among them.
+        # The checks of the card already state the reasons for care, except a change of ground.
         care = section.name == "trust" and section.grade == "care"
         cards.append(section._replace(blocks=blocks, text=summary.partly_because or "" if care else section.text))
     up = "The drive from above, north up" if summary.gnss.datum is not None else "The drive from above"
@@ -194,36 +199,36 @@ def _cards(summary: RunDocument, report: DropoutDocument) -> list[Section]:
 
 
 def _settings(summary: RunDocument) -> list[Section]:
-    """Return the sections with the choice of streams, the findings about them, and the configuration of a run."""
-    why: list[Block] = [Facts([(role_word(summary, stream.role), stream.why) for stream in summary.streams])]
+    """Return the sections with the chosen streams, the findings about them, and the configuration of a run."""
+    stream_blocks: list[Block] = [Facts([(role_word(summary, stream.role), stream.why) for stream in summary.streams])]
     alignment = []
     for name, finding in summary.alignment.items():
         value, applied = plus_minus(finding.value, finding.std, 4, ""), plus_minus(finding.applied or None, None, 4, "")
         alignment.append((name, value, applied, finding.why))
     caption = "Alignment of the streams: what was found and corrected"
-    why.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
+    stream_blocks.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
     return [
-        Section("Why these streams, and what was found of them", why, PAGE),
+        Section("Why these streams, and what was found of them", stream_blocks, PAGE),
         Section("Configuration that the run was made with", [Line(format_settings(summary.config), "as is")], PAGE),
     ]
 
 
 def read_report(directory: Path) -> DropoutDocument | None:
-    """Return the content of a run directory's report.json; None where it has none.
+    """Return the content of the report.json in a run directory; None if the run has no report.
 
     Raises
     ------
     RunError
-        It is not a report of this version, or was edited.
+        Another version wrote the report, or it was edited.
     """
     name = f"{DROPOUT_DIRECTORY}/{REPORT_FILE}"
     file = directory / name
     if not os.path.lexists(file):
         return None
-    if name in (sums := _listed(directory)):
+    if name in (sums := _checksums(directory)):
         check_sum(directory, name, sums)
     if schema_of(Below(directory, name)) != DROPOUT_SCHEMA:
-        raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
+        raise RunError(file, f"is not a report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
     try:
         return read_document(Below(directory, name), DropoutDocument)
     except (ValueError, RecursionError) as err:
@@ -232,22 +237,22 @@ def read_report(directory: Path) -> DropoutDocument | None:
 
 
 def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
-    """Return the pictures in the directories of a run and of its dropout report."""
+    """Return the pictures of a run and of its dropout report by name; none without a directory."""
     if directory is None:
         return {}
-    sums = _listed(directory)
+    sums = _checksums(directory)
     return pictures_in(Below(directory, "plots"), sums) | pictures_in(
         Below(directory, f"{DROPOUT_DIRECTORY}/plots"), sums
     )
 
 
-def _listed(directory: Path) -> dict[str, str]:
-    """Return the sums of the files of a run; none where it has no list of them."""
+def _checksums(directory: Path) -> dict[str, str]:
+    """Return the checksums of the files of a run by path; none if the run has no list of checksums."""
     return read_sums(directory) if os.path.lexists(directory / CHECKSUM_FILE) else {}
 
 
 def draw_pictures(run: Run) -> dict[str, Picture]:
-    """Draw the pictures of a run anew, into memory."""
+    """Return new pictures of a run by name."""
     from icrtool.output.figure_catalogue import figures_of
 
     return drawn_pictures(figures_of("run", run))
@@ -258,8 +263,8 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, Dropo
 
     Notes
     -----
-    Coordinates of a metric position reference may be map coordinates, so their origin is moved, too. Magnetic
-    declination and grid convergence give a hint of the place. They are left out, with their names.
+    The coordinates of a metric position reference may be map coordinates, so their origin is moved, too. Magnetic
+    declination and grid convergence would show the place roughly, so they are left out, also in the texts of notes.
     """
     document, changed = run.document, msgspec.structs.replace
     north, east = float(run.table.north_m[0]), float(run.table.east_m[0])
@@ -287,7 +292,8 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
 
     Parameters
     ----------
-    folder : of the batch; pages of logs that exist in it are linked
+    document : content of fleet.json
+    folder : folder of the batch; the page links to the pages of logs in it
     """
     logs, title, counts = document.logs, folder.absolute().name, document.counts
     unusable = sum(log.status == "done" and not log.usable for log in logs)
@@ -311,7 +317,7 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
 
 
 def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
-    """Return the table of the calibration from all logs of each robot."""
+    """Return the table of the calibrations: the numbers of each robot from all its logs."""
     grouped = any(calibration.group for calibration in calibrations)
     rows: list[list[str | Cell]] = []
     incomplete, labels = (
@@ -352,7 +358,7 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
 
 
 def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
-    """Return a table with a row a log that links to its page; a failed log has its reason in place of numbers."""
+    """Return the table of the logs: a row links to the page of its log; a failed log has no numbers."""
     varied = [key for key in ("robot", "group") if len({getattr(log, key) for log in logs} - {""}) > 1]
     # Distances within a budget come from the best model that at least one log has.
     distances = dict.fromkeys(name for log in logs for name in log.errors if "_within_" in name)
@@ -366,7 +372,7 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
         status = Cell("not usable", note=log.reason) if log.status == "done" and not log.usable else log.status
         names = [getattr(log, key) for key in varied]
         page = PurePosixPath(log.run) / PAGE_FILE
-        # No link to a page that does not exist or lies outside the folder.
+        # The page of a log is linked only if it exists and lies in the folder.
         link = "" if page.is_absolute() or not is_regular(Below(folder, page)) else f"./{quote(str(page))}"
         numbers = [log.reason] if log.status == "failed" else columns.values()
         rows.append([Cell(log.log, link=link), status, *names, *numbers])
@@ -374,16 +380,16 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
         chosen = {key: getattr(log, key) for key in ("status", "robot", "group")}
         search.append({"words": " ".join(words).casefold()} | chosen)
     caption = (
-        f"The name of a log opens its page. Errors: 95 % of the trials of {CHOICE_HORIZON_M:g} m stay below; under it "
-        "the 95 % interval. Next drive: the distance that 9 of 10 further drives on this ground keep, with the row "
-        "before it."
+        f"The name of a log opens its page. Error: 95 % of the trials of {CHOICE_HORIZON_M:g} m stay below it; the "
+        "95 % interval stands under it. Next drive: 9 of 10 further drives on this ground stay within the budget over "
+        "this distance, with the row in the column before."
     )
     head = ("log", "status", *varied, *next(iter(numbers_of), ()))
     return Table(f"ll{'l' * len(varied)}r", rows, head, caption, search=search, folded=_folded_columns(logs))
 
 
 def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
-    """Return the cells of a log, by the name of the column; `budgets`: error names of distances."""
+    """Return the cells of a log by the name of the column; `budgets` are keys of distances in `log.errors`."""
     day, _, time = log.start_utc.removesuffix("Z").partition("T")
     columns = {
         "start": Cell(day, order=log.start_utc, more=(time[:5],) if time else ()),
@@ -410,7 +416,7 @@ def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
 
 
 def _error_cell(log: FleetLog, model: str) -> Cell:
-    """Return the error of a model in a log at `CHOICE_HORIZON_M`, with its interval where that is known."""
+    """Return the cell of the 95 % error of a model at `CHOICE_HORIZON_M`, with its interval if it is known."""
     p95, low, high = (
         log.errors.get(f"{model}_{number}_{CHOICE_HORIZON_M:g}m_m") for number in ("p95", "p95_low", "p95_high")
     )
@@ -419,15 +425,17 @@ def _error_cell(log: FleetLog, model: str) -> Cell:
 
 
 def _error_column(model: str) -> str:
+    """Return the name of the column with the errors of a model."""
     return f"error, {model}"
 
 
 def _folded_columns(logs: Sequence[FleetLog]) -> list[str]:
-    """Return the columns of a fleet that are shown on demand: further rows, ICRs, events, and limits where none failed.
+    """Return the names of the columns of a fleet that a page shows only on demand.
 
     Notes
     -----
-    The other columns fit on a screen of 1280 pixels.
+    These are further rows, ICRs, events, and acceptance limits if all are met. The other columns fit on a screen of
+    1280 pixels.
     """
     names = {name.partition("_p95_")[0] for log in logs for name in log.errors}
     unfolded = (CONTROLLER, MAIN_ROW if MAIN_ROW in names else FALLBACK_ROW, "no_slip")
@@ -437,11 +445,12 @@ def _folded_columns(logs: Sequence[FleetLog]) -> list[str]:
 
 
 def _cell(value: float | None, text: Callable[[Any], str]) -> Cell:
-    """Return the cell of a number of a log; an unknown number is sorted last in any order."""
+    """Return the cell of a number; an unknown number is an empty cell, which is always sorted last."""
     return Cell("", order="") if value is None else Cell(text(value), order=value)
 
 
 def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
+    """Return the cell of a number with its standard deviation; `sign` is ``+`` to print the sign of any number."""
     return _cell(value, lambda number: plus_minus(number, std, sign=sign))
 
 
@@ -455,6 +464,7 @@ def calibration_page(calibration: Calibration) -> str:
 
 
 COMPARISON_FAMILY = "icrtool/compare/"
+"""First part of the schema of a comparison, without its version."""
 
 
 def comparison_page(comparison: GroupComparison, title: str) -> str:
@@ -466,7 +476,7 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
         f"{name}: {counted(len(group.logs), 'log')}, {labels.get(group.model, group.model)}"
         for name, group in comparison.groups.items()
     )
-    # The errors in the runs of each group over distance, by the group of the calibration.
+    # For each group: the errors of all calibrations in its runs, over distance.
     by_group: list[dict[str, object]] = []
     looks = rows_of(f"calibration:{name}" for name in names)
     for tested_on in names:
@@ -485,9 +495,9 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
             for name in names
         ]
         by_group.append({"horizons_m": horizons, "models": models, "reference": {"p95": [], "expected": []}})
-    # the chart begins with the group in whose runs a foreign calibration costs most
+    # The chart first shows the group in which a foreign calibration adds the largest error.
     costs = [cost for cost in comparison.costs if cost.horizon_m == CHOICE_HORIZON_M and cost.p95_m is not None]
-    dearest = max(costs or comparison.costs, key=lambda cost: cost.p95_m or 0.0, default=None)
+    costliest = max(costs or comparison.costs, key=lambda cost: cost.p95_m or 0.0, default=None)
     verdict = comparison_title(comparison)
     sections = [
         block for block in transfer_blocks(comparison) if len(comparison.pairs) > 1 or not isinstance(block, str)
@@ -500,13 +510,13 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
         (*VENDOR, "columns.js", "charts.js", "comparison.js"), {"by_group": by_group}, title=title,
         kind=f"Drive without GNSS: groups of runs compared ({title})",
         blocks=[verdict._replace(about=f"Groups: {groups}."), *sections], drawn=group_sketch(comparison), groups=names,
-        opened="" if dearest is None else dearest.tested_on, folded_models=0,
+        opened="" if costliest is None else costliest.tested_on, folded_models=0,
         pictures=drawn_pictures([("transfer", transfer(comparison))]),
     )  # fmt: skip
 
 
 def _comparison_answer(comparison: GroupComparison, verdict: Section) -> Section:
-    """Return the errors of the groups and their differences as cards, with the verdicts."""
+    """Return the answer of a comparison as cards: errors of the groups, a chart, and the verdicts."""
     at = f"after {CHOICE_HORIZON_M:g} m"
     own_errors = (cell for cell in comparison.transfer if cell.calibrated_on == cell.tested_on)
     rows = [_row_of_errors(cell.tested_on, cell, "") for cell in own_errors if cell.horizon_m == CHOICE_HORIZON_M]
@@ -524,7 +534,7 @@ def _comparison_answer(comparison: GroupComparison, verdict: Section) -> Section
 
 
 def _row_of_errors(name: str, error: ErrorsAt, sign: str) -> tuple[str, str, str]:
-    """Return a name, its 95 % error, and the interval; empty texts for what is not known."""
+    """Return the row of a 95 % error [m]: name, error, interval; unknown numbers are empty texts."""
     if error.p95_m is None:
         return name, "", ""
     known = error.p95_low_m is not None and error.p95_high_m is not None
@@ -533,7 +543,7 @@ def _row_of_errors(name: str, error: ErrorsAt, sign: str) -> tuple[str, str, str
 
 
 def comparison_in(place: Path) -> Place | None:
-    """Return the file of a comparison: `place` itself, or the first one in this folder; None where there is none."""
+    """Return the file of a comparison: `place` itself, or the first such file in this folder; None if there is none."""
     files: list[Place] = [place]
     if place.is_dir():
         files = [Below(place, file.name) for file in sorted(place.glob("*.json"))]

@@ -1,4 +1,4 @@
-"""Templates and pictures to HTML: all texts are escaped, all content is in the file, and nothing else may be loaded."""
+"""Pages as HTML: all texts are escaped, all content is in the file, and the page may load nothing else."""
 
 from __future__ import annotations
 
@@ -25,55 +25,57 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DOCUMENT_ERRORS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
-"""Errors that a page raises for a JSON document that was edited."""
+"""Errors that are raised while a page is made of a JSON document that was edited."""
 
 STYLE_SHEETS = ("vendor/uPlot.min.css", "page.css")
+"""Style sheets of every page, in ``static``."""
 
 BEGIN = "document.documentElement.classList.replace('no-js', 'js');"
-"""Script that runs before anything is shown. Without scripts, elements that only a script can draw stay hidden."""
+"""Script that runs before anything is shown. If scripts are off, elements that only a script can draw stay hidden."""
 
 UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|mm|km|s|min|h|Hz|m/s|%|°|±)(?![\w]))|(?<=±) (?=[\d.])")
-"""The space between a value and its unit, and the spaces around ±."""
+"""Pattern of the space between a value and its unit, and of the spaces around ±."""
+
 RANGE = re.compile(r"(?<=\d)-(?=\d+(\.\d+)?\xa0)")
-"""The hyphen of a range of values."""
+"""Pattern of the hyphen in a range of values."""
 
 MINUS = re.compile(r"(?<![\w.)])-(?=\d)")
-"""The sign of a negative number."""
+"""Pattern of the sign of a negative number."""
 
 IN_SCRIPT = {ord("<"): "\\u003c", ord(">"): "\\u003e", ord("&"): "\\u0026"}
-"""Escapes in JSON, so that no text in it can end the element around it."""
+"""Escapes of characters in JSON. Without them a text could end the script element around it."""
 
 
 def render(
     scripts: Sequence[str], data: Mapping[str, object] | None, *, title: str, kind: str, blocks: Sequence[Block],
     **content: object,
 ) -> str:  # fmt: skip
-    """Return a page as HTML; text in it is escaped twice: for a reader, and for HTML.
+    """Return a page as HTML. Its texts are escaped for a reader (control characters), and for HTML.
 
     Parameters
     ----------
     scripts : names of files in ``static``, in the order in which they run
-    data : data for the scripts; None: nothing
-    kind : kind of the report, for its title
+    data : data for the scripts; None: no data
+    title, kind : title of the page, and kind of the report
     blocks : content of the page; the first `Title` among them is its heading
-    content : values that the templates of drawings name
+    content : further values that the templates use
     """
     from markupsafe import Markup
 
     style = "\n".join(_static(name) for name in STYLE_SHEETS)
     code = [BEGIN, *(_static(name) for name in scripts)]
     # Hashes in the form in which a content security policy names a style or a script.
-    of_style, *of_scripts = (
+    style_hash, *script_hashes = (
         f"'sha256-{b64encode(sha256(text.encode()).digest()).decode('ascii')}'" for text in (style, *code)
     )
     policy = (
-        f"default-src 'none'; img-src data:; style-src {of_style}; "
-        f"script-src {' '.join(of_scripts)}; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; img-src data:; style-src {style_hash}; "
+        f"script-src {' '.join(script_hashes)}; base-uri 'none'; form-action 'none'"
     )
-    # JSON with any text that is safe in a script element.
+    # The JSON is escaped, so that it is safe in a script element.
     written = json.dumps(plain_value(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
     return _environment().get_template("base.html").render(
-        # Texts of icrtool, not of a log: they are not escaped.
+        # These texts are icrtool's own and not of a log, so they are not escaped.
         policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(script) for script in code[1:]],  # noqa: S704
         data=None if data is None else Markup(written),  # noqa: S704 - escaped for a script element
         tool_version=__version__, title=title, kind=kind, blocks=list(stated_blocks(blocks)),
@@ -83,16 +85,16 @@ def render(
 
 @cache
 def _environment() -> Environment:
-    """Return the templates, compiled once a process."""
+    """Return the environment of the templates, which are compiled once in a process."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup, escape
 
     def shown(value: object) -> object:
-        """Return the printed text of a value, without characters that hide or reorder other characters."""
+        """Return a value for a page; in a text, characters that hide or reorder other characters are escaped."""
         return escaped(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
     def with_units(text: str) -> Markup:
-        """Return a text whose values stay on one line with their units and standard deviations."""
+        """Return a text in which no line breaks between a value and its unit or standard deviation."""
         printed = MINUS.sub("−", str(escape(escaped(text))))
         return Markup(RANGE.sub("\u2011", UNIT.sub("\xa0", printed)))  # noqa: S704 - escaped
 
@@ -113,7 +115,7 @@ def _environment() -> Environment:
 
 
 def _grouped(rows: Sequence[tuple[str, str]]) -> list[tuple[str, list[str]]]:
-    """Return labelled sentences by label; a sentence without a label belongs to the label before it."""
+    """Return the sentences of each label, in order; a sentence without a label belongs to the label before it."""
     groups: list[tuple[str, list[str]]] = []
     for name, text in rows:
         if name or not groups:
@@ -123,26 +125,28 @@ def _grouped(rows: Sequence[tuple[str, str]]) -> list[tuple[str, list[str]]]:
 
 
 def _static(name: str) -> str:
+    """Return the text of a file in ``static``."""
     return files("icrtool.output.page").joinpath("static", *name.split("/")).read_text(encoding="utf-8")
 
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a PNG file."""
 
 LARGEST_PICTURE_BYTES = 1 << 24
-"""Largest size of a picture that is read [bytes]. Pictures of icrtool have less than 1 MB."""
+"""Largest size of a picture that is read [bytes]. icrtool's pictures have less than 1 MB."""
 
 PICTURE = re.compile(r"[a-z_]{1,40}(_\d{1,4}m)?")
-"""Pattern of the names of icrtool's pictures, without the suffix."""
+"""Pattern of the names of icrtool's pictures without their suffix."""
 
 
 class Picture(NamedTuple):
-    """One picture of a page.
+    """A picture of a page.
 
     Attributes
     ----------
-    title, caption : one line each: what it shows, what to look for
-    source : data URL
-    with_place : its axes may be coordinates of a map grid
+    title, caption : content of the picture, and what to look for, one line each
+    source : the PNG file as a data URL
+    with_place : whether its axes may be coordinates of a map grid
     """
 
     title: str
@@ -152,23 +156,24 @@ class Picture(NamedTuple):
 
 
 def drawn_pictures(figures: Iterable[tuple[str, Figure]]) -> dict[str, Picture]:
-    """Return figures as pictures, by name."""
+    """Return named figures as pictures by name."""
     from icrtool.output.figures.style import picture_bytes
 
     return pictures_of((name, picture_bytes(figure, "png")) for name, figure in figures)
 
 
 def pictures_in(directory: Below, sums: Mapping[str, str] | None = None) -> dict[str, Picture]:
-    """Return the PNG pictures of a folder that this module knows, by name; none where the folder is not there.
+    """Return icrtool's PNG pictures in a folder by name; none if the folder does not exist.
 
     Parameters
     ----------
-    sums : BLAKE2b sums (hex) of files by their path from `directory.folder`, where they are known
+    directory : the folder
+    sums : known BLAKE2b checksums (hex) of files, by their path relative to `directory.folder`
 
     Raises
     ------
     RunError
-        A file is not a picture that icrtool made: a link, another file, too large, or with another sum.
+        A file with the name of a picture is a link, no PNG file, too large, or has another checksum.
     """
     from icrtool.output.figure_catalogue import entry_of
 
@@ -181,6 +186,7 @@ def pictures_in(directory: Below, sums: Mapping[str, str] | None = None) -> dict
 
 
 def _png(file: Below, sums: Mapping[str, str]) -> bytes:
+    """Return the bytes of a PNG file; parameters and errors as in `pictures_in`."""
     name = PurePath(file.name).as_posix()
     try:
         content = read_regular(file, LARGEST_PICTURE_BYTES)
@@ -194,7 +200,7 @@ def _png(file: Below, sums: Mapping[str, str]) -> bytes:
 
 
 def pictures_of(files: Iterable[tuple[str, bytes]]) -> dict[str, Picture]:
-    """Return pictures given as name and PNG file."""
+    """Return named PNG files as pictures by name; a name that is not in the catalogue is left out."""
     from icrtool.output.figure_catalogue import entry_of
 
     pictures = {}

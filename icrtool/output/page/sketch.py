@@ -1,4 +1,4 @@
-"""A drive and the ICRs of a robot from above, errors of groups: small drawings in the page, without a script."""
+"""Small drawings in a page that need no script: a drive, the ICRs of a robot, the errors of groups."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.run import ICR_COLUMNS, Run
 
 WIDTH, HEIGHT, MARGIN = 360.0, 240.0, 16.0
-"""Size of a sketch and its free edge [units of the drawing, one pixel or less each]."""
+"""Width, height and free edge of a sketch [units of the drawing]. A unit is at most a pixel."""
 
 LONGEST_BAR = 0.3
-"""Largest length of the scale bar, as a share of the width."""
+"""Largest length of the scale bar, as a share of the width of the sketch."""
 
 NEAR = 1.5
 """Distance of two points below which the second one is not drawn [units of the drawing]."""
@@ -30,10 +30,11 @@ class Sketch(NamedTuple):
 
     Attributes
     ----------
-    path, worst : of an SVG path: the whole drive; the trial with the largest error, empty where there is none
-    start, end : first and last place (x, y)
-    bar, bar_m : length of the scale bar [units of the drawing] and what it stands for [m]
-    width, height : of the drawing
+    path : the drive, as an SVG path
+    worst : the trial with the largest error, as an SVG path; empty if there is none
+    start, end : first and last place (x, y) [units of the drawing]
+    bar, bar_m : length of the scale bar [units of the drawing], and the distance that it stands for [m]
+    width, height : size of the drawing [units of the drawing]
     """
 
     path: str
@@ -51,7 +52,7 @@ def drive_sketch(run: Run, report: DropoutDocument) -> Sketch:
     north, east = run.table.north_m, run.table.east_m
     low, high = np.array([east.min(), north.min()]), np.array([east.max(), north.max()])
     free = np.array([WIDTH, HEIGHT]) - 2.0 * MARGIN
-    # A robot that stands has no extent: a metre is shown.
+    # The view is at least one metre wide, because the drive of a robot that stands has no extent.
     scale = float(np.min(free / np.maximum(high - low, 1.0)))
     middle = (low + high) / 2.0
     x = WIDTH / 2.0 + scale * (east - middle[0])
@@ -66,7 +67,7 @@ def drive_sketch(run: Run, report: DropoutDocument) -> Sketch:
 
 
 def _rows_of_trial(run: Run, begin_s: float, horizon_m: float) -> tuple[int, int]:
-    """Return the first and the last row of a trial."""
+    """Return the first and the last row of a trial that begins at a time and is `horizon_m` long."""
     last = len(run.table) - 1
     begin = min(int(np.searchsorted(run.table.t_s, begin_s)), last)
     end = int(np.searchsorted(run.table.distance_m, run.table.distance_m[begin] + horizon_m))
@@ -74,7 +75,7 @@ def _rows_of_trial(run: Run, begin_s: float, horizon_m: float) -> tuple[int, int
 
 
 def _svg_path(x: Floats, y: Floats) -> str:
-    """Return an SVG path through points (n,), without points that lie on the one before them."""
+    """Return an SVG path through points (n,); a point that is closer than `NEAR` to the point before is left out."""
     parts: list[str] = []
     before = (math.inf, math.inf)
     for point in zip(x.tolist(), y.tolist(), strict=True):
@@ -85,20 +86,20 @@ def _svg_path(x: Floats, y: Floats) -> str:
 
 
 def _round_length(most_m: float) -> float:
-    """Return the largest of 1, 2, 5, 10, 20 … [m] that is not above a length."""
+    """Return the largest of the lengths 1, 2, 5, 10, 20 … [m] that is not above a length."""
     return float(max(step for step in round_steps(most_m) if step <= most_m))
 
 
 class Geometry(NamedTuple):
-    """A robot and its ICRs from above, forward up; the origin of the body in the middle.
+    """A robot and its ICRs from above. Forward is up, and the origin of the body is in the middle.
 
     Attributes
     ----------
-    icrs : x and y of each ICR, and half the length of its bars (σ) along x and y [units of the drawing]
-    tracks : x of each track
-    labels : text for each ICR
-    bar, bar_m : length of the scale bar [units of the drawing] and what it stands for [m]
-    width, height : of the drawing
+    icrs : x and y of the left and the right ICR, and their σ along x and y [units of the drawing]
+    tracks : x of the left and the right track [units of the drawing]
+    labels : text of the left and the right ICR
+    bar, bar_m : length of the scale bar [units of the drawing], and the distance that it stands for [m]
+    width, height : size of the drawing [units of the drawing]
     """
 
     icrs: tuple[tuple[float, float, float, float], ...]
@@ -111,7 +112,7 @@ class Geometry(NamedTuple):
 
 
 def geometry_sketch(calibration: Calibration) -> Geometry:
-    """Return the ICRs of a calibration and the tracks of its robot."""
+    """Return the drawing of the ICRs of a calibration and the tracks of its robot."""
     y_right, y_left, x_icr = (calibration.geometry[name] for name in ICR_COLUMNS)
     std_right, std_left, std_x = (calibration.geometry_std[name] for name in ICR_COLUMNS)
     half = calibration.width_m / 2.0
@@ -130,9 +131,13 @@ def geometry_sketch(calibration: Calibration) -> Geometry:
 
 
 class GroupError(NamedTuple):
-    """The error of a group on a scale: x of the number and of the ends of its interval, y [units of the drawing].
+    """The error of a group on a scale [units of the drawing].
 
-    `low`, `high`: None where there is no interval.
+    Attributes
+    ----------
+    name : name of the group
+    x, low, high : x of the error and of the ends of its interval; None without an interval
+    y : height of its row
     """
 
     name: str
@@ -143,12 +148,13 @@ class GroupError(NamedTuple):
 
 
 class GroupErrors(NamedTuple):
-    """The errors of groups, a row each, over one scale from zero.
+    """The errors of groups in rows, over one scale from zero.
 
     Attributes
     ----------
-    ticks : x of each tick [units of the drawing] and its number [m]
-    width, height : of the drawing
+    rows : the errors
+    ticks : x of each tick [units of the drawing], and its number [m]
+    width, height : size of the drawing [units of the drawing]
     """
 
     rows: tuple[GroupError, ...]
@@ -158,11 +164,11 @@ class GroupErrors(NamedTuple):
 
 
 ROW_HEIGHT, TICKS = 44.0, 4.0
-"""Height of a group's row [units of the drawing], and approximate number of ticks of the scale."""
+"""Height of the row of a group [units of the drawing], and approximate number of ticks of the scale."""
 
 
 def group_sketch(comparison: GroupComparison) -> GroupErrors:
-    """Return the 95 % errors of the groups at `CHOICE_HORIZON_M`, each by its own calibration, with 95 % intervals."""
+    """Return the drawing of the 95 % errors of groups at `CHOICE_HORIZON_M`, each by its own calibration."""
     own_errors = [
         cell
         for cell in comparison.transfer

@@ -153,7 +153,7 @@ def test_a_run_read_back_prints_the_same(whole: Run, stored: Run) -> None:
     assert stored._repr_html_() == whole._repr_html_()
 
 
-@pytest.mark.parametrize("name", [name for name, entry in FIGURES.items() if entry.of == "run"])
+@pytest.mark.parametrize("name", [name for name, entry in FIGURES.items() if entry.subject == "run"])
 def test_a_run_read_back_draws_the_same(name: str, whole: Run, stored: Run) -> None:
     first, second = (picture_bytes(FIGURES[name].draw(one), "png") for one in (whole, stored))
     assert first == second
