@@ -26,8 +26,10 @@ from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, step
 from icrtool.records.calibration_document import ErrorSources
 
 ANGLES, BISECTIONS = 24, 26
+"""Number of directions of an average over an ellipse, and of halvings of a radius."""
 
 SOURCES = ErrorSources.__struct_fields__.index("p95_factor")
+"""Number of sources of error."""
 
 STEP_M = 0.1
 """Length of the steps in which a planned path is driven [m]."""
@@ -36,13 +38,16 @@ SPEED_MPS = 0.5
 """Speed of a plan that states no speed [m/s]."""
 
 SLOWEST_PLAN_MPS = 0.02
+"""Smallest speed of a plan [m/s]. A slower speed is replaced by it."""
 
 INVERSIONS = 8
+"""Number of Newton steps that find wheel speeds for a motion."""
 
 FURTHEST_M = 1e8
 """Largest distance of a point of a plan from the origin [m]. The origin may be the origin of UTM coordinates."""
 
 LONGEST_PATH_M = 100_000.0
+"""Longest path of a forecast [m]."""
 
 Values = TypeVar("Values", Floats, Complexes)
 

@@ -42,8 +42,10 @@ from icrtool.records.calibration_document import ControllerErrors, ErrorSources
 from icrtool.records.plain_data import finite_or_none
 
 HELD_OUT_HORIZONS_M = (5.0, 10.0, 20.0)
+"""Distances of the held-out trials [m]."""
 
 SHORTEST_BLOCK_M, FEWEST_FOLD_BLOCKS, MOST_FOLD_BLOCKS = 25.0, 3, 5
+"""Shortest block of distance of a single drive [m], and smallest and largest number of blocks."""
 
 STRIP_M = 5.0
 """Shortest strip of distance [m]. One fit predicts all trials from one strip to another, to save time."""
@@ -55,13 +57,17 @@ HELD_OUT = (NO_SLIP, CONTROLLER, RECOMMENDED)
 """The rows of a held-out table. A row with a gyro has the same name with ``_gyro`` at the end."""
 
 GYRO_SUFFIX = "_gyro"
+"""End of the name of a row with a gyro."""
 
 TOO_SHORT = "too short to fit on one part and test on another"
+"""Consequence of a drive that is too short, for errors."""
 
 TWIST_OVER_M = 1.0
 """Length of the windows over which velocities are averaged for their errors [m]."""
 
 LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+"""Lengths of the windows that show how errors grow [m]."""
+
 ALWAYS_TO_M = 20.0
 """Largest length of held-out windows that is always compared [m]."""
 
@@ -72,6 +78,7 @@ SCALED_FROM_M = 5.0
 """Shortest windows that scale the quantiles [m]. In shorter windows the reference's noise exceeds the model's error."""
 
 FEWEST_HELD_OUT_WINDOWS = 20
+"""Number of windows of `SCALED_FROM_M` or more below which the growth of errors is not measured."""
 
 NORMAL_STRETCHES = 10
 """Weight of the assumption of normal errors, as a number of independent stretches.
@@ -80,6 +87,8 @@ The measured quantile of n stretches has the weight n / (n + 10). With 10 stretc
 this quantile between robots."""
 
 SMALLEST_VARIANCE = 1e-6
+"""Smallest variance that is stated to a controller, in the square of its unit."""
+
 FEWEST_TESTED = 10
 """Number of held-out windows below which the errors of a controller are not stated."""
 

@@ -37,6 +37,8 @@ ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION = (
     "antenna_right_minus_icr_middle_m",
     "icr_separation_m",
 )
+"""Keys of the estimates that the positions of antenna and ICRs are derived from."""
+
 FINDING_KINDS = {
     ANTENNA_AHEAD: _Kind("antenna forward − x ICR", 0.03),
     ANTENNA_ASIDE: _Kind("antenna right − middle of the ICRs", 0.03),
@@ -57,14 +59,19 @@ SHOWN_STRAIGHT = ("left_scale", "right_scale", "gnss_delay_s", "heading_offset_d
 """Parameters that a straight drive shows."""
 
 DELAYS = ("gnss_delay_s", "heading_delay_s", "gnss_delay_against_heading_s")
+"""Keys of the delays."""
+
 RESPONSE_PART = "the robot's own response to its wheels is part of it"
+"""Note on a delay that is known well."""
 
 STEADY = 0.15
 """Ratio of a speed's standard deviation to its mean below which the speed counts as steady."""
 
 MOVING_MPS, TURNING_DEGPS = 0.05, 2.0
+"""Speed of both sides above which a robot moves [m/s], and turn rate above which it turns [deg/s]."""
 
 SETTING_SIGMAS = 3.0
+"""Smallest difference of a proposed setting from its neutral value, in standard deviations."""
 
 
 LABELS = {key: kind.label for key, kind in FINDING_KINDS.items()} | {

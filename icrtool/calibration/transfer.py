@@ -32,6 +32,7 @@ from icrtool.records.run import Run
 from icrtool.records.text import with_interval, with_std
 
 TRANSFER_HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
+"""Distances of the errors of a comparison [m]."""
 
 TWO_SIDED = 1.96
 """Standard deviations in a 95 % interval."""
@@ -40,6 +41,7 @@ SAME_ROUTE_M = 1.0
 """Largest distance between two drives on the same route, at equal driven distance [m]."""
 
 COMPARED = ("y_icr_right_m", "y_icr_left_m", "x_icr_m", "multiplier", "radius_left", "radius_right")
+"""Fields of `TrackGeometry` that are compared."""
 
 
 def compare_groups(groups: Mapping[str, Sequence[Run]]) -> documents.GroupComparison:

@@ -53,6 +53,7 @@ WORKERS = options.options_as_record(
     option("--worker-timeout worker_timeout_s", "SECONDS", POSITIVE, "Give up a cluster that has had no scheduler "
            "or no worker for this time.", default=60.0),
 )  # fmt: skip
+"""Options of the executor of a batch, as `workers`."""
 
 
 BATCH = options.options_as_record(
@@ -64,6 +65,7 @@ BATCH = options.options_as_record(
     options.CONFIGURATION,
     options.INPUT_LIMITS,
 )
+"""Options of a batch, as `batch` and `exports`."""
 
 
 @options.command("batch")

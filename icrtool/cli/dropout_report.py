@@ -67,6 +67,7 @@ REPORT_OPTIONS = options.report_options(
     flag("--trials", "Write every trial to trials.parquet."),
     option("--seed", None, click.IntRange(min=0), "Seed of the random draws."),
 )  # fmt: skip
+"""Options of a report, as `place`, `calibrations`, `report`, `files`, `baseline` and `exports`."""
 
 
 @options.command("dropout-report", epilog=EPILOG_GATE)

@@ -53,6 +53,7 @@ REQUEST = options.options_as_record("request", f"{options.REQUESTS_MODULE}:FitRe
     flag("--smooth", "Also write the RTS smoother's states (smoothed.csv)."),
     options.CUT,
 ))  # fmt: skip
+"""Options of a fit, as `request`, `files`, `place` and `warm_start`."""
 
 
 @options.command("fit")

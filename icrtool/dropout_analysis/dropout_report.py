@@ -51,6 +51,7 @@ from icrtool.records.text import distance_text
 from icrtool.records.topic_poses import TopicPoses
 
 ERROR_FIELDS = len(documents.ErrorRow.__struct_fields__)
+"""Number of fields of `ErrorRow`, which are the first fields of `SummaryRow`."""
 
 
 def dropout(

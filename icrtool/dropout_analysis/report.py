@@ -45,14 +45,19 @@ if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
 
 _NUMBER_FORM = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+"""Pattern of a number without a sign."""
+
 _FORM = re.compile(
     r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max|p95_next|within|within_next)@(?P<at>\d+(?:\.\d+)?)\s*m?\s*"
     rf"(?P<relation><=|>=|<|>)\s*(?:(?P<bound>[+-]?{_NUMBER_FORM})\s*m?|"
     rf"(?:(?P<factor>{_NUMBER_FORM})\s*\*\s*)?(?P<baseline>baseline)(?:\s*(?P<offset>[+-]\s*{_NUMBER_FORM})\s*m?)?)\s*$"
 )
+"""Pattern of an acceptance limit."""
+
 _RELATIONS: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
 }  # fmt: skip
+"""Functions of the relations of a limit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,6 +322,7 @@ def pooled_baseline(drives: Sequence[documents.DropoutDocument], log: str, path:
 
 
 _ERROR_COLUMNS = tuple(name for name in documents.SummaryRow.__struct_fields__ if name not in ("horizon_m", "trials"))
+"""Fields of a row of errors that are numbers."""
 
 
 def _numbers_of(drives: Sequence[documents.DropoutDocument], model: str, horizon_m: float, name: str) -> Floats:

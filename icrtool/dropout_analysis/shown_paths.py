@@ -25,13 +25,23 @@ from icrtool.records.rows import row_of
 from icrtool.records.run import Run, track_of
 
 WORST_COUNT = 10
+"""Number of worst trials."""
+
 WORST_HORIZON_M = 10.0
+"""Distance of the worst trials [m]."""
+
 MOST_ON_PATH = 20_000
 """Largest number of trials whose errors are kept by their start: a picture has some thousand places."""
 
 EXAMPLE_HORIZON_M = 15.0
+"""Distance of the typical trials [m], as in Figs. 33 and 34 of Pentzer 2014."""
+
 ALIKE_RAD = np.radians(10.0)
+"""Largest difference from half a turn of a typical cornering trial [rad]."""
+
 STRAIGHT_SHARE, LONGEST_CHORD = 0.05, 1.1
+"""Share of the trials that count as straight, and largest ratio of a chord to its distance."""
+
 TYPICAL_OF = 30
 """Approximate number of trials from which the typical one, with the median error, is chosen."""
 
@@ -39,6 +49,7 @@ LONGEST_SHARE = 0.5
 """Largest share of the moving time that spaced outages take. The filter learns in the rest."""
 
 MOST_SPACED = 10
+"""Largest number of evenly spaced outages."""
 
 SAME_M = 1e-6
 """Largest difference [m] between disturbed and undisturbed run before the first outage. They differ only by

@@ -77,6 +77,7 @@ DRAWS = 20_000
 """Number of errors drawn for each horizon. With this number p95 is known to 1 %."""
 
 POSE = ("north_m", "east_m", "heading_rad")
+"""Columns of the states that the reference consists of."""
 
 GNSS_NIS, HEADING_NIS = 2.0, 1.0
 """Expected mean NIS of fixes and of headings if the noise is right: the number of measured components."""
@@ -177,11 +178,16 @@ def with_smoothed_reference(run: Run) -> Run:
 
 
 SPLIT_HORIZON_M = 5.0
+"""Distance of the straight and turning trials [m]."""
+
 STRAIGHT_RAD = math.radians(10.0)
+"""Largest range of the headings of a straight trial [rad]."""
+
 CELLS_A_HORIZON = 20
 """Number of cells of path in a horizon, to find the range of the heading."""
 
 SPLIT_MODELS = ("icr", "no_slip")
+"""Rows whose straight and turning trials are compared."""
 
 
 def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:

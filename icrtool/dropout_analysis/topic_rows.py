@@ -34,6 +34,7 @@ FEWEST_COMPARED, MOST_COMPARED = 200, 4000
 NOT_OPEN_LOOP = "GNSS or a map while it drives: not open loop"
 GROWS = "not known: computed on the robot; its error grows with distance, as of dead reckoning"
 UNDECIDED = "not known: computed on the robot; whether GNSS or a map is in it does not show"
+"""Words for the data of a scored topic: its error does not grow with distance, it grows, or this is not known."""
 
 
 class Departure(NamedTuple):

@@ -35,6 +35,8 @@ WIDTH_M = 1.0
 """Track width of the terms here [m]. The ICRs do not depend on its value."""
 
 HEADING_BIAS_RAD = math.radians(1.0)
+"""Standard deviation of the heading's offset before a drive [rad]."""
+
 SCALE_ERROR = 0.02
 """Standard deviation of the wheels' scale, and of the difference of the sides' scales, before a drive. A circle alone
 does not separate the ICRs from these scales and the heading's offset."""
@@ -194,6 +196,7 @@ def multiplier_std(covariance: Floats, track_width_m: float) -> float:
 
 
 SPIN_BOTH = "drive two full turns on the spot to the right and two to the left"
+"""Advice for a drive with too few turns."""
 
 SLIP_SHARE = 0.03
 """Standard deviation of slip from window to window, as a share of distance and of turn."""
@@ -206,6 +209,8 @@ AT_LIMIT = 1.1
 """Ratio of a y ICR to the filter's limit below which it is the limit and not an estimate."""
 
 TURNS_NEEDED_RAD = math.pi
+"""Sum of the turns to both sides below which a drive lacks turns [rad]."""
+
 STEERS = 0.1
 """Ratio of the turn by the sides to the robot's turn below which the sides do not turn the robot."""
 

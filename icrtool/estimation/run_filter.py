@@ -171,8 +171,13 @@ TOLERATED_NIS = 1.25
 noise."""
 
 STEP = 2.0
+"""Factor between two tried process noises."""
+
 LARGEST_POSITION_MPS = 10.0
+"""Largest process noise of the position [m/s]."""
+
 LARGEST_HEADING_DEGPS = 120.0
+"""Largest process noise of the heading [deg/s]."""
 
 TAIL_DEGREES = 4.0
 """Degrees of freedom of Student's t: Lange, Little and Taylor 1989 recommend it where outliers are few but gross."""
@@ -182,6 +187,7 @@ LIKE_COST = 0.1
 this."""
 
 MOST_ROUNDS = 3
+"""Largest number of searches over both noises."""
 
 Moving = tuple[Bools, Bools]
 """Which fixes (m,) and which headings (h,) were measured while the wheels turned."""

@@ -42,7 +42,11 @@ TWIST_SIGMAS = 2.0
 robot does: its controller then corrects the slip."""
 
 WORTH_WARNING_SHARE = 0.1
+"""Share of rejected measurements from which on there is a warning."""
+
 DELAY_SIGMAS = 3.0
+"""Delay above which the clock of a stream is the cause of rejected measurements, in standard deviations."""
+
 LARGEST_TURN_UNEXPLAINED, UNEXPLAINED_SIGMAS = 0.5, 2.0
 """Unexplained share of the turns' variance above which wheels explain almost none of the turns, and the number of
 standard deviations by which it must be above."""

@@ -51,10 +51,18 @@ process."""
 
 _POINTER, _INTEGER, _FLOAT, _BOOL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_bool
 _ARRAY_FORM = (_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER)
+"""C types of the first five words of an array."""
+
 _BYTE = ctypes.c_char
 _LLVM_TYPES = {_POINTER: "ptr", _INTEGER: "i64", _FLOAT: "double", _BOOL: "i8"}
+"""Types of LLVM by C type."""
+
 _SCALARS = {"bool": _BOOL, "int": _INTEGER, "float": _FLOAT, "NoneType": _POINTER}
+"""C types of numbers and None by the name of their Python type."""
+
 _RESULTS = {"none": None, "int64": _INTEGER, "float64": _FLOAT}
+"""C types of results by the name of their type in numba."""
+
 _DEBUGGING = ("NUMBA_BOUNDSCHECK", "NUMBA_DEBUGINFO")
 """Settings of numba with which machine code is slower: it is not kept for later processes."""
 

@@ -41,6 +41,7 @@ class Histogram(NamedTuple):
 
 
 SHARES = {"p50": 0.5, "p95": 0.95}
+"""Shares of the trials below each percentile."""
 
 FEWEST_PATH_BLOCKS = 3
 """Smallest number of blocks of path for an interval. A path of less than twelve horizons has no interval."""

@@ -9,6 +9,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit, njit_part
 
 GRAVITY_MPS2 = 9.81
+"""Acceleration of gravity [m/s^2]."""
 
 ROLLING_MPS = 0.02
 """Speed at which the rolling resistance is 0.7 of its limit [m/s]: it keeps the equations smooth about standstill."""

@@ -110,6 +110,7 @@ def step_back(gains: Floats, x_predicted: Floats, P_predicted: Floats, x: Floats
 
 
 HUBER_SIGMAS = 2.5
+"""Size of an innovation, in standard deviations, to which larger innovations are limited."""
 
 
 class HeadingEvents(NamedTuple):

@@ -187,6 +187,7 @@ MAX_BLOCK = 32768
 """Number of starts of the longest block, and of states whose moments are kept at once. It bounds the memory to a few
 MB."""
 _EPS = 2.220446049250313e-16
+"""Distance from 1 to the next double."""
 
 
 class BlockPlan(NamedTuple):

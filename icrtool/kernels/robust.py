@@ -31,6 +31,7 @@ LAST_STEP_SIGMAS = 0.03
 """Length of a Gauss-Newton step, in standard deviations of all parameters together, below which it is the last step."""
 
 MOST_HALVINGS = 6
+"""Largest number of halvings of a Gauss-Newton step."""
 
 FEWEST_CORRELATED_BLOCKS = 8
 """Smallest number of values from which a correlation between neighbours is estimated."""

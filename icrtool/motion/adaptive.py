@@ -77,6 +77,8 @@ WHEELS_MODEL, TURNED_MODEL = MODELS[RECOMMENDED], MODELS[RECOMMENDED].with_gyro(
 """The models with wheels alone, and with wheels and gyro."""
 
 SHARED_TERMS = [name for name in WHEELS_MODEL.terms if name in TURNED_MODEL.terms]
+"""Names of the terms that both models have."""
+
 SHARED_OF_WHEELS, SHARED_OF_TURNED = (
     [model.terms.index(name) for name in SHARED_TERMS] for model in (WHEELS_MODEL, TURNED_MODEL)
 )

@@ -40,6 +40,7 @@ class SampleRow(IntEnum):
 
 
 POSE_ROWS = [SampleRow.NORTH, SampleRow.EAST, SampleRow.HEADING]
+"""Rows of samples with the pose."""
 
 KNOT_T, KNOT_SEGMENT, KNOT_KNOWN, KNOT_STEPS, KNOT_SAMPLES = 0, 4, 5, 6, 7
 """Rows of the knots (8, m): time, segment, whether the pose is known, number of complete steps, samples in these steps.

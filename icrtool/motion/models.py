@@ -166,6 +166,7 @@ CONTROLLER = "controller"
 
 _FIVE = ("vx_v", "vx_w", "omega_w", "omega_v", "vy_w")
 _EIGHT = (*_FIVE, "vy_vw", "omega_sw", "omega_vw")
+"""Names of the terms of `FIVE` and of `RECOMMENDED`."""
 
 MODELS: dict[str, MotionModel] = {
     model.name: model
@@ -291,6 +292,7 @@ SHOWN_SIGMAS = 3.0
 """Number of standard deviations that a parameter must differ from zero to widen its prior."""
 
 TINY = 1e-20
+"""Size of a complex step."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,6 +49,7 @@ STRETCH_M = 20.0
 """Distance within which errors depend on one another [m], for the covariance: twice the longest window."""
 
 FEWEST_FIT_WINDOWS = 10
+"""Smallest number of windows for a fit."""
 
 
 class LogConstants(NamedTuple):
@@ -81,6 +82,7 @@ class LogConstants(NamedTuple):
 
 
 NO_CONSTANTS = LogConstants()
+"""Constants of a recording in which nothing has to be corrected."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ vy_w; from ground to ground omega_w differs by 0.03.
 """
 
 OTHER_ROBOTS = "other robots"
+"""Source of a prior that comes from other robots."""
 
 
 @functools.cache

@@ -41,6 +41,7 @@ LAST_DELAY_STEP_SIGMAS = 0.1
 step is not reached."""
 
 REWEIGHTS = 2
+"""Number of reweighted steps of a fit without a fold."""
 
 FEWEST_TO_SUBTRACT = 4
 """Number of recordings from which on one of them is subtracted from the fit of all. With fewer, the others are fitted

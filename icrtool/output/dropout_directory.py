@@ -44,10 +44,15 @@ from icrtool.records.stages import Watch, unwatched
 from icrtool.records.text import counted, escaped
 
 REPORT_FILE = "report.json"
+"""Name of the file with all results of a report."""
+
 TRIALS_FILE = "trials.parquet"
+"""Name of the file with every trial."""
+
 DROPOUT_DIRECTORY = "dropout"
 """Name of a report's directory in its run directory."""
 DROPOUT_FAMILY = "icrtool/dropout/"
+"""First part of the schema of a report, without its version."""
 
 
 def write_report(
@@ -100,6 +105,7 @@ REPORT = DirectoryKind(
     lambda place: is_dropout_directory(place) or is_run_directory(place.parent),
     re.compile(REPORT_FILES),
 )
+"""The directory of a dropout report."""
 
 
 def write_tables(report: DropoutReport, directory: Path) -> None:
@@ -127,11 +133,13 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
 
 
 HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent")
+"""Columns of histogram.csv."""
 
 WORST_CSV_COLUMNS = (
     "rank", "model", "stamp_ns", "t_s", "north_m", "east_m", "horizon_m", "heading_change_deg", "speed_mean_mps",
     *(f"{model}_error_m" for model in IN_CSV),
 )  # fmt: skip
+"""Columns of worst.csv."""
 
 
 ROWS_A_GROUP = 1 << 18
@@ -178,6 +186,7 @@ def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
 
 
 BASELINE_ADVICE = "name a report.json, a run with a dropout report, or the folder of a batch"
+"""Advice in errors about a baseline that cannot be used."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ Subject = Literal["run", "report", "fleet", "comparison"]
 Parts = Mapping[str, tuple[float, ...]]
 
 HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
+"""Distances of the histograms [m], as in Figs. 28 to 30 of Pentzer 2014."""
 
 
 ONCE: Parts = {"": ()}

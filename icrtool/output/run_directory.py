@@ -49,18 +49,25 @@ from icrtool.records.text import LONGEST_NAME, escaped, escaped_texts, listed, s
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
 PAGE_FILE = "report.html"
+"""Names of the files of a run with its summary, its slip events, and its page."""
 
 STATES_FORMATS: tuple[StatesFormat, ...] = get_args(StatesFormat)
+"""Formats of states; the first that is found is read."""
 
 MOST_CSV_STATES = 1_000_000
 """Largest number of states that are written as CSV by default. With more states, states.csv is larger than 300 MB and
 takes longer to read than the log."""
 
 RUN_FAMILY = "icrtool/run/"
+"""First part of the schema of a run, without its version."""
 
 _FIGURES = "|".join(f"{name}[0-9]+m" if name.endswith("_") else name for name in FIGURES)
 PICTURE_FILES = rf"plots/(({_FIGURES})\.(png|svg|pdf))?"
+"""Pattern of the names of pictures."""
+
 REPORT_FILES = rf"report\.json|(summary|histogram|worst|ladder)\.csv|trials\.parquet|{PICTURE_FILES}"
+"""Pattern of the names of files in a dropout report."""
+
 RUN_FILES = (
     r"run\.json|events\.csv|measurements\.npz|(states|smoothed)\.(csv|parquet)|B2SUMS"
     rf"|report\.html|{PICTURE_FILES}|dropout/({REPORT_FILES})?"
@@ -290,6 +297,7 @@ RUN = DirectoryKind(
     lambda place: is_run_directory(place) or is_regular(Below(place, formats.SOURCES_FILE)),
     re.compile(RUN_FILES),
 )
+"""The directory of a run."""
 
 
 def is_page(first: bytes) -> bool:
@@ -303,6 +311,7 @@ def events_csv(events: Sequence[EventDocument]) -> bytes:
 
 
 FIT_AGAIN = "fit the log again"
+"""Advice in errors about a run that cannot be read."""
 
 NAMES_IN_THE_LOG = ("topic", "message_type")
 """Keys of run.json whose texts are stored as in the log, without escapes."""

@@ -27,6 +27,7 @@ LEAST_END_M = 0.001
 RANGE_PERCENT = (0.2, 99.8)
 """Percentiles of a column that limit its shown range, so that a single spike has no effect on the scale."""
 SCALE_MARGIN, LEAST_HALF_RANGE_M = 1.12, 0.02
+"""Ratio of a scale to the range that it shows, and half of its smallest range [m]."""
 
 BREAK_SHARE, BREAK_IN_INTERVALS = 0.01, 5.0
 """Shortest gap over which no line is drawn: the share of the whole time, and the number of usual intervals."""

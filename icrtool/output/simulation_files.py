@@ -32,6 +32,7 @@ from icrtool.simulation.drives import TrackSpeeds, TruthTable
 from icrtool.simulation.study_records import StudyResult
 
 SPEED_COLUMNS = ("t_s", "v_left_mps", "v_right_mps")
+"""Columns of a file with given track speeds."""
 
 
 def truth_path(log: Path) -> Path:
@@ -82,6 +83,7 @@ BAG = DirectoryKind(
     lambda place: (place / "metadata.yaml").is_file(),
     re.compile(r"metadata\.yaml|[^/]+\.(db3|mcap)(\.zstd)?"),
 )
+"""A ROS 2 bag directory."""
 
 
 def write_truth(table: TruthTable, path: Path) -> None:
@@ -115,8 +117,13 @@ def read_speeds(path: Path) -> TrackSpeeds:
 
 
 STUDY_SCHEMA = "icrtool/study/1"
+"""Schema of study.json."""
+
 STUDY_FILE = "study.json"
+"""Name of the file with parameters and statistics of a study."""
+
 STUDY_FAMILY = "icrtool/study/"
+"""First part of the schema of a study, without its version."""
 
 
 def check_study_target(directory: Path) -> None:
@@ -171,3 +178,4 @@ STUDY = DirectoryKind(
     lambda place: schema_of(Below(place, STUDY_FILE)).startswith(STUDY_FAMILY),
     re.compile(rf"study\.json|({'|'.join(get_args(StudyName))})\.(csv|png|svg|pdf)"),
 )
+"""The directory of a study."""

@@ -227,6 +227,7 @@ def format_blocks(blocks: Iterable[Block], *, verbose: bool = True) -> str:
 
 GRADE_LOOKS: dict[Grade, Look] = {"good": "good", "care": "as is", "bad": "bad", "fact": "as is"}
 GRADE_MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": ""}
+"""Look of a line, and mark before it, by the grade of a check."""
 
 
 def printed_parts(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:

@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from icrtool.records.run_document import DriveDocument, ReferenceJumpDocument, RunDocument
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Pattern of the characters that XML 1.0 cannot hold."""
 
 PATH_WORDS = {
     "filter": "filter", "smoothed": "smoother", "icr": "ICR odometry", "icr_momentary": "momentary-ICR odometry",
     "no_slip": "no-slip odometry",
 }  # fmt: skip
+"""Words for the paths of a run."""
 
 GLOSSARY = {
     "ICR": "Instantaneous centre of rotation of a track: the point of the ground, seen from the robot, about which it "

@@ -30,6 +30,7 @@ PAPER_ICRS_M: Icrs = (0.5, -0.75, -0.25)
 """True y_icr_right, y_icr_left, x_icr of the simulations in Pentzer 2014, Section 5 [m]."""
 
 GYRO_STD_RADPS = 0.003
+"""White noise of the turn rate in the Imu messages [rad/s]."""
 
 MOST_SIMULATED_SAMPLES = 20_000_000
 """Largest number of samples of a sensor and of steps of the truth: 5.5 h at the default step."""

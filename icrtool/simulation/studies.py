@@ -50,6 +50,7 @@ MODEL_ICR_STD_M = 0.1
 """Initial standard deviation of the ICRs in case ``model``: small enough for an EKF to be nearly linear."""
 
 CONSISTENCY_WORDS = {"nees": "NEES", "nis_gnss": "NIS of fixes", "nis_heading": "NIS of headings"}
+"""Words for the numbers of study consistency."""
 
 
 # What varies
@@ -193,8 +194,13 @@ def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
 
 
 WINDING = replace(PLAN, path=PathPlan("curved", radius_m=2.0), duration_s=200.0)
+"""Drive on a path with many bends."""
+
 STUDY_NOISES = tuple(round(0.05 * step, 2) for step in range(11))
+"""Sizes of the noise and of the bias of the track speeds [m/s]."""
+
 ERROR_COLUMN = "error_{icr}_m"
+"""Pattern of the names of columns with ICR errors."""
 
 
 def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> Study:
@@ -216,11 +222,23 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
 
 
 PATHS: tuple[PathKind, ...] = ("circle", "curved", "lawnmower", "spins")
+"""Kinds of paths of study convergence."""
+
 PATH_TIMES = {"circle": "2.9-12.8 s, driven (Figs. 15, 17)", "": "5-15 s, driven"}
+"""The paper's convergence times by kind of path; the empty key is for all others."""
+
 STARTS = ("proper start", "inverted start")
+"""Names of the kinds of starts of study initial."""
+
 START_FATES = {"no guard": "starts with y_icr_right > 0 (Fig. 6)", "": "all (Fig. 7)"}
+"""The paper's results by sign guard."""
+
 CHANGE_TIMES = {"inflated": "0.03-0.17 s (Fig. 9)", "": "100-140 s (Fig. 8)"}
+"""The paper's convergence times after a change."""
+
 RADIUS_TIMES = {0.0: "0.1 s (Fig. 10)", 2.0: "1.8 s (Fig. 10)"}
+"""The paper's convergence times by radius of the turn [m]."""
+
 TABLE_III = {
     "y_icr_right": {0.4: "0.65 ± 0.01 (Table III)", 1.6: "0.49 ± 0.02", 4.0: "0.49 ± 0.01"},
     "y_icr_left": {0.4: "-0.64 ± 0.01 (Table III)", 1.6: "-0.56 ± 0.02", 4.0: "-0.61 ± 0.04"},
@@ -229,6 +247,7 @@ TABLE_III = {
 """Mean and standard deviation of each ICR [m], by speed [m/s]."""
 
 RTK_ERROR = {0.01: "within 3.8 m for 95 % (RTK, tracked, Fig. 29)"}
+"""The paper's open-loop error by noise of the fixes [m]."""
 
 STUDIES: dict[str, Study] = {
     "convergence": Study(
@@ -379,6 +398,7 @@ STUDIES: dict[str, Study] = {
         summary=consistency_of,
     ),
 }  # fmt: skip
+"""Every study by name."""
 
 
 def default_request(name: str, config: Config) -> StudyRequest:

@@ -21,6 +21,7 @@ PLAN = DrivePlan(step_s=0.005)
 """Default drive of a study. Its track speeds are held for 0.005 s, which is not longer than any wheel interval."""
 
 IDEAL = Sensors(wheels="ideal", heading_resolution_rad=0.0)
+"""Sensors whose wheel speeds have no error."""
 
 Column = Floats | Ints | list[float | str]
 

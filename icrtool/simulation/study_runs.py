@@ -33,10 +33,17 @@ STOP_EVERY_S = 5.0
 
 
 ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")
+"""Names of the ICRs in columns."""
+
 STUDY_STATES = ("north", "east", "heading", *ICR_NAMES)
+"""Names of the states in columns."""
+
 FATES = ("converged", "inverted", "elsewhere")
+"""Outcomes of a run with given initial ICRs."""
 
 SETTLED_SHARE = 0.1
+"""Share of its initial error below which an estimate counts as settled."""
+
 SETTLED_M = 0.02
 """Error below which an estimate counts as settled [m]. It also counts as settled below a tenth of its initial error."""
 
@@ -44,11 +51,17 @@ CONVERGED_M = 0.1
 """Largest error of a converged run's ICRs [m]: all three, averaged over the last tenth of the run."""
 
 LAST_SHARE = 10
+"""The last part of a run is one of this number of equal parts."""
 
 TRACE_POINTS = 400
+"""Approximate number of rows of a trace."""
+
 ZOOM_S = 10.0
+"""Time around a change of the ICRs that is shown [s]."""
 
 TRIAL_M = 10.0
+"""Distance of an open-loop trial [m]."""
+
 TRIAL_STARTS = 40
 """Number of open-loop trials of a run. Their starts are evenly spaced."""
 

@@ -27,6 +27,7 @@ from icrtool.records.run import ICR_COLUMNS
 CONTROLLER_TARGETS: tuple[ControllerTarget, ...] = get_args(ControllerTarget)
 
 EXPORT_SCHEMA = "icrtool/export/1"
+"""Schema of an export of target ``json``."""
 
 NOT_PLANAR = 0.001
 """Variance of z, roll and pitch, which a plane does not show: the value the controller's own documentation gives."""
@@ -65,6 +66,7 @@ amcl:
   ros__parameters:
     robot_model_type: "nav2_amcl::DifferentialMotionModel"
 """
+"""Parameters of AMCL and of robot_localization, with places for covariances and noises."""
 
 
 def format_export(calibration: Calibration, target: ControllerTarget) -> str:
@@ -220,14 +222,18 @@ def one_line(text: str) -> str:
 
 
 TWIST_SCHEMA = "icrtool/twist/1"
+"""Schema of an export of target ``icr``."""
 
 AXES = {VX: "v_x", VY: "v_y", OMEGA: "yaw_rate"}
+"""Names of the outputs in an export of target ``icr``, by axis."""
+
 SYMBOLS = {
     "v": "(v_left + v_right) / 2",
     "w": "(v_right - v_left) / b",
     "spin": "abs(v_left - v_right) / (abs(v_left) + abs(v_right)), 0 where both are 0",
     "b": "track_width_m",
 }
+"""Meanings of the symbols in the formulas of an export of target ``icr``."""
 
 
 def format_twist(calibration: Calibration) -> str:

@@ -45,11 +45,15 @@ INTERVAL_S = 0.05
 """Shortest interval between two written states [s]."""
 
 WORLD = "map"
+"""Frame of the world."""
+
 LIBRARY = EXPORTED_MCAP.decode()
+"""Name of the library in the header of the file."""
 
 BODIES: dict[PathName, str] = {
     "filter": "base_link", "smoothed": "smoothed", "icr": "icr_odometry", "no_slip": "no_slip_odometry",
 }  # fmt: skip
+"""Frame of the body that drives each path."""
 
 GBAS_FIX, PLAIN_FIX = 2, 0
 """Codes of NavSatStatus."""
@@ -269,6 +273,8 @@ def _set_stamp(message: Any, stamp_ns: int) -> None:  # noqa: ANN401 - a message
 
 
 SMALLEST_SCENE_M = 5.0
+"""Smallest size of the scene in view [m]."""
+
 VIEW_IN_EXTENT = 1.4
 """Distance of the camera, in sizes of the filter's path."""
 

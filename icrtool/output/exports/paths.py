@@ -43,6 +43,7 @@ LINE_CELL_M = 0.05
 """Side of the grid cells that thin a line [m]. A line has a point where it enters another cell."""
 
 METRIC_ONLY = "its position reference is metric, so its place on the globe is not known"
+"""Reason for which a run has no place on the globe."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +164,7 @@ def outage_rows(run: Run) -> Iterator[tuple[tuple[int, int], slice]]:
 
 
 SUFFIXES: dict[TrajectoryFormat, str] = {"evo": ".tum", "kitti": ".kitti"}
+"""Suffix of a file with a trajectory, by format."""
 
 DIGITS = 9
 """Number of decimals of positions [m] and of entries of rotations."""
@@ -308,6 +310,7 @@ def _event_features(run: Run, globe: Globe) -> Iterator[Feature]:
 
 
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
+"""Namespaces of KML and of its extensions by Google."""
 
 TRACK_INTERVAL_S = 1.0
 """Interval between two places of the drive over time [s]."""
@@ -315,6 +318,7 @@ TRACK_INTERVAL_S = 1.0
 EXPORT_COLORS: dict[PathName | str, str] = {
     "filter": "#000000", "smoothed": "#606060", "icr": BLUE, "no_slip": ORANGE, "outage": "#ffff00",
 }  # fmt: skip
+"""Colours of lines in KML, by path, and of outages."""
 
 
 def format_kml(run: Run) -> str:

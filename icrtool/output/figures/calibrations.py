@@ -171,6 +171,8 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | No
 
 
 LONGEST_GROUP_NAME = 12
+"""Largest number of characters in the name of a group."""
+
 MOST_DIFFERENCES = 24
 """Largest number of differences that are drawn at all distances. Of more, those after `CHOICE_HORIZON_M` are drawn."""
 
@@ -296,7 +298,11 @@ def _draw_forest(axes: Axes, rows: Sequence[Difference], *, about_zero: bool = F
 
 
 ROW_IN = 0.22
+"""Height of the row of a log [in]."""
+
 MOST_CALENDAR_ROWS = 40
+"""Largest number of logs that have a row each. More logs are drawn over their dates."""
+
 LEAST_DAYS = 1.0
 """Shortest span of a date axis [days]. matplotlib would show four years for a single date."""
 

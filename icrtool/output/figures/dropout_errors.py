@@ -24,16 +24,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PANEL_HEIGHT_IN, LOW_PANEL_IN = 2.0, 1.45
+"""Heights of the panel of one model, and of the panel of one horizon [in]."""
 
 P95 = style.line_look("black", width=1.2)
 """Line of the 95 % mark: solid in every picture; the expected value is dashed (`MEAN`)."""
 
 THIN = 0.9
+"""Width of the lines of rows for comparison [points]."""
 
 BANDS = (("", 0.32, "its 95 % interval", 1.4), ("next_", 0.13, "next drive, 9 of 10", 1.3))
 """Bands of the first row: part of the names of their ends, opacity, label, order."""
 
 BAND_TOPS = ("p95_high_m", "p95_next_high_m")
+"""Fields with the upper ends of the bands."""
 
 MOST_BAND = 3.0
 """Largest ratio of the end of the scale to the largest line. A wider band is cut off."""
@@ -46,9 +49,14 @@ BAR_STEP = 0.009
 """Distance of these bars from one row to the next, as a share of the axis."""
 
 TITLE_CHARACTERS = int(style.TITLE_CHARACTERS_PER_INCH * style.WIDTH_IN)
+"""Number of characters that fit into a title."""
 
 END_LINE = style.line_look("0.45", (0, (1.0, 2.0)), 1.0)
+"""Line at the distance at which lines or bands end."""
+
 UNIT_SPACE = re.compile(r"(\d) m\b")
+"""Pattern of a number of metres and its unit."""
+
 END_CHARACTERS = 30
 """Characters in a line of the text where lines and bands end."""
 
@@ -56,6 +64,7 @@ LEAST_SHOWN = 0.7
 """Ratio of the lower end of the scale to the smallest drawn error, and of the largest drawn error to the upper end."""
 
 MOST_DECADES = 4.0
+"""Largest range of the scale of errors, in decades."""
 
 LEAST_HISTOGRAM_IN_P95 = 1.3
 """Ratio of the end of the histograms' common scale to the largest p95 of the models."""
@@ -68,6 +77,7 @@ SUMMARY_KEY_COLUMNS = 3
 """Number of columns in the legend of the summary."""
 
 MOSTLY_BEYOND_PCT = 90.0
+"""Share of trials beyond the scale of a histogram above which a sentence replaces its bars [%]."""
 
 
 @styled

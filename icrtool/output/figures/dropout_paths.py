@@ -38,17 +38,28 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WORST_COLUMNS, WORST_ROWS = 3, 2
+"""Number of columns and rows of cells with the worst trials."""
+
 WORST_CELL_IN = 2.15
+"""Height of a cell [in]."""
+
 WORST_LAYOUT: Any = {"margins_in": (0.15, 0.15, 0.98, 0.5), "wspace": 0.12, "hspace": 0.27}
+"""Margins of the cells, as in `icrtool.output.figures.style.new_figure`."""
+
 CELL_TITLE: style.Look = {"loc": "left", "pad": 4.0, "fontsize": 8.5}
+"""Look of the title of a cell."""
 
 OUTAGES = {
     "forced": style.line_look(style.BAD_FIX_COLOR, width=1.8),
     "real": style.line_look("black", (0, (2.0, 1.2)), 1.8),
 }
+"""Lines of the paths in outages, by kind of outage."""
+
 PATH = style.line_look(style.FIX_COLOR, width=1.4)
+"""Line of the path outside of outages."""
 
 NO_BREAK = "\N{NO-BREAK SPACE}"
+"""Character in place of a space at which no line breaks."""
 
 EXAMPLE_CHARACTERS = 44
 """Characters in a line above a typical trial."""
@@ -59,10 +70,13 @@ MAP_MARGINS_IN = (0.75, 1.1, 0.65, 1.0)
 BAR_SHARE = 0.4
 """Largest length of the bar of a scale, as a share of the width."""
 FRAME_COLOR = "0.75"
+"""Colour of the frame of a cell."""
+
 LOST_LOOK: style.Look = {"color": "0.82", "linewidth": 6.0, "solid_capstyle": "butt", "zorder": 1}
 """Line beneath the paths where no fix corrected the reference."""
 
 SLOWEST_SHOWN_MPS = 0.001
+"""Smallest mean speed of a trial from which its duration is computed [m/s]."""
 
 
 @styled
@@ -251,7 +265,11 @@ ERROR_STEPS = 7.0
 """Approximate number of steps of the colours. An error is read from a step, not from a gradient."""
 
 UNSCORED = style.line_look("0.80", width=1.0)
+"""Line of parts of the path at which no trial starts."""
+
 ERROR_LINE_PT = 3.4
+"""Width of the line that is coloured by the error [points]."""
+
 MOST_OF_P95 = 1.5
 """Largest ratio of the end of the colours to the 95 % error. Larger errors have the last colour."""
 
@@ -259,6 +277,7 @@ CELLS_A_STEP = 3.0
 """Length of a coloured part of the path, in cells of the view."""
 
 MARKED_WORST = 3
+"""Number of worst trials whose starts are marked."""
 
 
 @styled

@@ -31,10 +31,13 @@ if TYPE_CHECKING:
 
 
 SEGMENT = style.line_look(ORANGE, width=1.6)
+"""Line of the mean ICR between two terrain changes."""
+
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 """Places of the ICRs without slip, in half track widths."""
 
 NO_SLIP_PLACE = {"label": "no slip (±b/2, 0)", **style.HALF_WIDTH}
+"""Line of an ICR without slip."""
 
 BAND_RANGE_PERCENT = (2.0, 98.0)
 CLUSTER_RANGE_PERCENT = (0.5, 99.5)
@@ -47,13 +50,18 @@ DRIVE_LOOK: style.Look = {
     "marker": "s", "markersize": 4.0, "color": style.ICR["color"], "linestyle": "none", "elinewidth": 1.4,
     "capsize": 2.0,
 }  # fmt: skip
+"""Marker of the ICR of the whole drive."""
 
 LONG_RUN = 2.5
 """Ratio of the run to its learning time from which on the learning has its own panel."""
 LEARNING_MARGIN = 0.6
+"""Time after the convergence that the panel of the learning shows, as a share of the learning time."""
+
 LEAST_MARGIN_S = 10.0
+"""Smallest such time [s]."""
 
 ICR_BINS = 30
+"""Approximate number of bins of a histogram of an ICR."""
 
 
 def _time_axis(span_s: float) -> tuple[str, float]:
@@ -227,6 +235,8 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
 
 
 MOST_SINGLE = 1500
+"""Largest number of used fixes that are drawn one by one."""
+
 TIME_BINS = 300
 """Number of equal times in which more than `MOST_SINGLE` used fixes are drawn, by their range and median."""
 

@@ -47,11 +47,14 @@ def study_subtitle(result: StudyResult) -> str:
 
 
 PANEL_IN = 2.1
+"""Height of a panel [in]."""
 
 MARKS_A_LINE = 9
 """Number of marks on a line. Marks distinguish lines without colours."""
 
 LEAST_RANGE_M, LEAST_VIEW_M = 0.02, 0.6
+"""Smallest range of a panel of errors, and of a panel of ICRs [m]."""
+
 BEYOND = 1.6
 """Ratio of the range of a panel of starts to the largest start."""
 
@@ -65,10 +68,19 @@ STUDY_LOOKS: tuple[style.Look, ...] = (
 """Looks of lines that show no ICRs, in turn."""
 
 OPEN_LOOP = {"label": "open loop, final ICRs", **STUDY_LOOKS[3]}
+"""Look of the open-loop error with the final ICRs."""
+
 OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP_LINE}
+"""Look of the open-loop error without slip."""
+
 PATH_COLORS = (BLUE, ORANGE, GREEN, RED)
+"""Colours of kinds of paths, in turn."""
+
 WIDE: style.Look = {"linewidth": 1.5}
+"""Width of the line of an estimate."""
+
 TRUTH: style.Look = {"linewidth": 0.9, "linestyle": (0, (4, 2))}
+"""Line of the truth."""
 
 Draw = Callable[["Axes", StudyResult, list[Level]], None]
 """Draws the levels of one series."""
@@ -288,6 +300,8 @@ TOGETHER: frozenset[str] = frozenset({"consistency"})
 """Pictures whose series share a panel."""
 
 NOTE = "lines: median; bars and bands: 5 to 95 % of the runs"
+"""Sentence above the legend of every study."""
+
 NOTES: dict[str, str] = {
     "initial": "colours: share of the runs; above the dashed line the start is proper",
     "consistency": "model: truth drawn from Q and R; paper and field: exact kinematics, preset's start",

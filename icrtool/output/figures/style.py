@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
 
 PNG_DPI = 130
+"""Resolution of PNG files [dots per inch]."""
 
 WIDTH_IN = 7.2
 """Width of most figures [in]: the text width of a page."""
@@ -34,7 +35,10 @@ KEY_ROW_IN = 0.2
 """Height of a row of a legend [in]. Figures have space for two rows."""
 
 TITLE_CHARACTERS_PER_INCH, SUBTITLE_CHARACTERS_PER_INCH = 9.75, 13.5
+"""Characters of a title and of a subtitle in an inch of width."""
+
 TITLE_PT, SUBTITLE_PT = 10.8, 9.0
+"""Sizes of title and subtitle [points]."""
 
 MARGINS_IN = (0.75, 0.2, 0.65, 1.05)
 """Left, right, top and bottom of the axes of most figures [in]."""
@@ -77,6 +81,7 @@ RC: dict[str, Any] = {
     "svg.hashsalt": "icrtool",
     "pdf.fonttype": 42,
 }
+"""Settings of matplotlib for all figures."""
 
 SAVE: dict[str, dict[str, Any]] = {
     "svg": {"metadata": {"Date": None, "Creator": "icrtool"}},
@@ -88,6 +93,7 @@ PNG_COLORS = 256
 """Number of colours of a PNG file. It needs half of the time and a third of the bytes of full colour and looks the
 same."""
 NEARLY_WHITE = 252
+"""Value of a part of a colour, of 255, from which on it becomes white in a PNG file."""
 
 
 def line_look(color: str, dash: str | tuple[float, tuple[float, ...]] = "-", width: float = 1.3) -> Look:
@@ -105,9 +111,15 @@ FILTER = line_look("black", width=1.1)
 ICR = line_look(BLUE, (0, (6, 2)), 1.5)
 NO_SLIP_LINE = line_look(ORANGE, (0, (6, 1.5, 1.2, 1.5)), 1.5)
 HALF_WIDTH = line_look("0.35", (0, (1.5, 2.0)), 1.1)
+"""Line at half the track width: an ICR without slip."""
+
 CHANGE_LINE = line_look(RED, (0, (3, 1.5)), 1.1)
 MEAN = line_look("black", (0, (5, 2)), 1.1)
+"""Line of a mean."""
+
 BUDGET = line_look(RED, (0, (1.5, 2.0)), 1.2)
+"""Line of an error budget."""
+
 COLORS: dict[Color, str] = {
     "green": GREEN, "purple": PURPLE, "blue": BLUE, "orange": ORANGE, "grey": "#666666", "brown": "#8c510a",
     "pink": "#c51b7d", "teal": "#01665e", "olive": "#7a7a00", "slate": "#5c6f8a",
@@ -117,6 +129,7 @@ COLORS: dict[Color, str] = {
 DASHES: dict[Dash, str | tuple[float, tuple[float, ...]]] = {
     "solid": "-", "dashed": (0, (6, 2)), "dotted": (0, (1.5, 1.5)), "dashdot": (0, (6, 1.5, 1.2, 1.5)),
 }  # fmt: skip
+"""Dashes of matplotlib by the names in `icrtool.records.rows`."""
 
 ROW_WIDTH = 1.45
 """Width of the line of most rows [points]."""

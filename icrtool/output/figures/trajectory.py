@@ -27,14 +27,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PATH_MARGINS_IN = (0.75, 0.2, 0.65, 1.45)
+"""Left, right, top and bottom of the axes [in]."""
 
 LARGEST_DETOUR = 0.75
 """Distance outside the filter's path to which odometry is shown, in sizes of this path. Further parts are cut off."""
 
 SMALLEST_DRIVE_M = 2.0
+"""Smallest size of the filter's path for the limit of shown odometry [m]."""
+
 TIME_STEPS_S = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 7200.0, 14400.0)
+"""Intervals between the times that are written at the path [s]; the first that gives few enough is used."""
+
 MOST_TIMES = 12
+"""Largest number of times that are written at the path."""
+
 MOST_MARKED_JUMPS = 5
+"""Largest number of marked jumps of the reference."""
 
 REJECTED_CELLS = 40.0
 """Number of cells across the view in which rejected fixes share one cross."""
@@ -60,7 +68,11 @@ FIX_LOOKS: dict[int, style.Look] = {
     FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": style.FLOAT_COLOR},
     OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
 }
+"""Markers of used fixes, by class."""
+
 SLIP_LOOK: style.Look = style.spot_look("none", 6.5, "D", style.FLOAT_COLOR) | {"markeredgewidth": 1.6, "zorder": 4.6}
+"""Marker of the begin of a slip event."""
+
 REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
 """Marker of rejected fixes. Shape and luminance distinguish the markers of all classes."""
 
@@ -193,7 +205,11 @@ BOX_HEIGHT_IN = (2.4, 5.4)
 """Smallest and largest height of the axes of a whole drive [in]."""
 
 SMALLEST_VIEW_M = 0.5
+"""Smallest size of a view [m]."""
+
 FAR_M = 20_000.0
+"""Coordinate from which on whole kilometres stand in the name of the axis [m]."""
+
 CELLS_A_VIEW = 1500.0
 """Number of cells across the view. Points in one cell, about a pixel, are drawn as one point."""
 

@@ -223,6 +223,7 @@ def held_out_blocks(table: HeldOut) -> list[Block]:
 
 
 MEANINGS = "shown: found well enough to set; weak: found roughly; not shown, not separable: this drive cannot find it"
+"""Meanings of the verdicts on parameters."""
 
 OPTIONS_WIDTH = 76
 """Number of characters of options in a line of a terminal of 80 columns, without indent and backslash."""
@@ -262,6 +263,7 @@ def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
 
 
 SHOWN_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+"""Distances of the rows of a forecast [m]."""
 
 
 def forecast_csv(forecast: Forecast, gyro: Forecast | None = None) -> str:

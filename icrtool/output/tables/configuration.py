@@ -9,11 +9,13 @@ from dataclasses import fields
 from icrtool.config import SECTIONS, Config, describe_key, key_texts
 
 CONFIGURATION_WIDTH = 110
+"""Largest number of characters in a line of a configuration file."""
 
 CONFIGURATION_HEAD = """\
 # Configuration of icrtool, for --config FILE.toml; --set section.key=value changes single keys.
 # Each key is shown with its default; remove the # before it and change it. Behind it: its type and bounds.
 """
+"""First lines of a configuration file."""
 
 
 def format_configuration(config: Config) -> str:

@@ -63,6 +63,7 @@ ReachRow = tuple[str, str, str, str]
 
 NEXT_DRIVE = "next drive, 9 of 10"
 NEXT_DRIVE_MEANS = "next drive: this robot, this kind of ground"
+"""Title of the column with the range of the next drive, and its meaning."""
 
 
 def format_dropout(report: DropoutReport) -> str:

@@ -27,6 +27,7 @@ NOTED_STANDING = 0.05
 """Smallest share of standing states that is printed."""
 
 SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
+"""Distances of the columns of the errors [m]."""
 
 NO_TRIAL = {
     "too_little_way_left": "not counted: log ends", "across_wheel_gap": "  across a wheel gap",

@@ -11,8 +11,13 @@ from icrtool.records.text import counted
 from icrtool.simulation.study_records import Level, StudyNumber, StudyRequest, StudyResult
 
 ERROR_WORDS = {f"error_{column}": word for column, word in ICR_WORDS.items()}
+"""Headings of the columns with the error of each ICR."""
+
 SETTLE = {"settle_s": "all within 10 % [s]"}
+"""Heading of the column with the settling time."""
+
 INVERTED = {"inverted": "inverted"}
+"""Heading of the column with the share of inverted runs."""
 
 SHOWN: dict[str, dict[str, str]] = {
     "convergence": SETTLE | INVERTED,
