@@ -21,17 +21,16 @@ from icrtool.motion.window_fit import Prediction
 def prior_for(
     recording: Recording, calibrations: Sequence[Calibration] = (), *, refit_sensors: bool = False
 ) -> TermsPrior:
-    """Return the prior for a recording: from the first calibration not fitted to it, else from other robots.
+    """Return the prior for a recording: from the first calibration that was not fitted to it, else from other robots.
 
     Parameters
     ----------
-    refit_sensors : the constants of the calibration's sensors are not used
+    refit_sensors : do not use the constants of the calibration's sensors
 
     Notes
     -----
-    Of the sensors' constants, the heading offset and the bias of the gyro come from the calibration. The delays begin
-    at those that were corrected in this log, as for row ``icr``: between five drives of one robot, recorded by one
-    computer, they differ by 0.08 s.
+    The heading offset and the bias of the gyro come from the calibration. The delays begin at the corrections of this
+    log, as for row ``icr``, because the delays of five drives of one robot, recorded by one computer, differ by 0.08 s.
     """
     unfitted = (calibration for calibration in calibrations if not calibration.fitted_to(recording.sha256))
     calibration = next(unfitted, None)
@@ -42,7 +41,7 @@ def prior_for(
 
 
 def samples_of(recording: Recording, rows: slice = slice(None)) -> Floats:
-    """Return the wheel samples and poses of a recording (10, n), as `AdaptiveModel` takes them."""
+    """Return the wheel samples and poses of a recording (10, n), in rows `SampleRow`."""
     wheels, track = recording.wheels(rows), recording.track
     samples = np.zeros((len(SampleRow), len(wheels.t)))
     samples[:3] = wheels.t, wheels.v_left, wheels.v_right
@@ -59,8 +58,9 @@ class KnownDrive:
 
     Attributes
     ----------
-    learned : the known models and constants, in order of time; the first entry holds before the drive
-    steps : the wheel samples joined; None: single samples
+    recording : the recording
+    learned : the known models and constants, in order of time; the first entry holds from before the drive on
+    steps : track with joined wheel samples; None: single samples
     """
 
     recording: Recording
@@ -68,7 +68,7 @@ class KnownDrive:
     steps: Track | None = None
 
     def errors(self, trials: Trials, *, turned: bool = False) -> TrialErrors:
-        """Return the errors of trials, each with the model that was known at its start; `turned`: with the gyro."""
+        """Return the errors (k, h) of trials, each with the model known at its start; `turned`: with the gyro."""
         errors = TrialErrors.none(trials.ends.shape)
         for number, chunk in self._by_learned(trials.starts):
             column, row = np.nonzero(trials.ends[chunk].T >= 0)
@@ -90,13 +90,13 @@ class KnownDrive:
         return path_between(self.recording, self._known(number, turned=turned), steps, start, end)
 
     def _steps_around(self, start: Ints, end: Ints | Rows) -> Track:
-        """Return the wheel samples of trials from some states to others."""
+        """Return the track with the wheel samples of trials from states `start` to states `end`."""
         track = self.recording.track
         span = float(track.t[start.min()]), float(track.t[end.max()])
         return self.recording.wheels(track.rows_around(*span)) if self.steps is None else self.steps.around(*span)
 
     def _by_learned(self, starts: Ints) -> Iterator[tuple[int, slice]]:
-        """Yield rows of the starts (ascending), and the number of the item of `learned` that was known at them."""
+        """Yield the number of each used item of `learned`, and the rows of ascending starts at which it was known."""
         known_s = np.array([learned.t_s for learned in self.learned])
         number = np.searchsorted(known_s, self.recording.track.t[starts], side="right") - 1
         first = np.flatnonzero(np.diff(number, prepend=-1))
@@ -104,6 +104,7 @@ class KnownDrive:
             yield int(number[lo]), slice(lo, hi)
 
     def _known(self, number: int, *, turned: bool) -> Prediction:
+        """Return model and constants of an item of `learned`; `turned`: with the gyro if there is one."""
         learned = self.learned[number]
         return (
             (learned.turned, learned.turned_constants)
@@ -113,16 +114,17 @@ class KnownDrive:
 
 
 def adapt(recording: Recording, prior: TermsPrior, past: Recording | None = None) -> KnownDrive:
-    """Return a recording with what `AdaptiveModel` learns along it, with its gyro where it has one.
+    """Return a recording with the models and constants that `AdaptiveModel` learns along it, by its gyro if it has one.
 
     Parameters
     ----------
-    past : the recording with the poses that were known when it was driven; default: its own
+    prior : prior of the robot
+    past : the recording with the poses that were known when it was driven; default: its own poses
     """
     past = recording if past is None else past
     model = AdaptiveModel(prior, with_gyro=recording.track.gyro is not None)
     learned = [model.now._replace(t_s=-np.inf)]
     for lo in range(0, len(recording.track.t), ROWS_AT_ONCE):
         learned += model.observe_all(samples_of(past, slice(lo, lo + ROWS_AT_ONCE)))
-    # The steps are the shortest for a log of any length, because its end must not change earlier predictions.
+    # The steps do not depend on the length of the log, because its end must not change earlier predictions.
     return KnownDrive(recording, tuple(learned), steps_of(recording, 0.0))

@@ -1,4 +1,4 @@
-"""Rows ``calibration`` of a report: calibrations that were given, tested in a log with their sensors' constants."""
+"""Rows ``calibration`` of a report: given calibrations, tested in a log with the constants of their sensors."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from icrtool.records.rows import PAST
 
 
 class CalibratedDrive(NamedTuple):
-    """A calibration in a log that it is tested on.
+    """A calibration, and a log that it is tested in.
 
     Attributes
     ----------
-    drive : the log, and the model and constants that were known at each time of it
-    sensors : the constants that the calibration holds, and the constants of the log
-    knows : where its constants come from, in words
-    notes : constants that the log contradicts
+    drive : the log, with the model and constants that were known at each time of it
+    sensors : the constants that the calibration holds, and the constants that the log shows
+    knows : sources of the used constants, in words
+    notes : findings about constants that the log contradicts
     """
 
     drive: KnownDrive
@@ -61,22 +61,22 @@ def calibrated_drive(
 
     Parameters
     ----------
-    row : name of its row
-    past : the recording with the poses that were known when it was driven; default: its own
-    with_gyro : with the recording's gyro
-    refit_sensors : all constants are fitted to the whole recording; no constant is held
+    row : name of the row in the report
+    past : the recording with the poses that were known when it was driven; default: its own poses
+    with_gyro : use the recording's gyro
+    refit_sensors : fit all constants to the whole recording, and hold none
 
     Raises
     ------
     ConfigError
-        As of `model_for`.
+        `model_for` raises it: the calibration is of another robot, or there is no gyro.
     DataError
         The drive is too short to find constants that the calibration does not hold.
 
     Notes
     -----
     Held constants include the corrections before a fit, so the corrections of this log are subtracted from them. The
-    bias of a gyro is learned from the turns before each start, from the held one on.
+    bias of a gyro begins at the held bias, and is learned from the turns before each start.
     """
     fitted = model_for(calibration, recording, with_gyro=with_gyro)
     total = pooled_constants(calibration.logs, recording.heading_source, with_gyro=with_gyro)
@@ -107,7 +107,7 @@ def calibrated_drive(
 
 
 def _knows(held: Sequence[str], unknown: Sequence[str]) -> str:
-    """Return in words where constants come from."""
+    """Return the sources of constants in words; `held` and `unknown` are names of `SensorConstants`."""
     parts = []
     if shown := [name for name in held if name != LEARNED]:
         parts.append(f"{words_of(shown)} held")
@@ -119,18 +119,19 @@ def _knows(held: Sequence[str], unknown: Sequence[str]) -> str:
 
 
 def _learned(fitted: FittedModel, constants: LogConstants, since_s: float = -np.inf) -> Learned:
-    """Return a model and constants as known from a time on."""
+    """Return a model and constants that are known from a time [s] on."""
     return Learned(since_s, 0.0, fitted, constants)
 
 
 def _with_biases(
     past: Recording, fitted: FittedModel, constants: LogConstants, std_radps: float
 ) -> tuple[Learned, ...]:
-    """Return a model with a gyro and constants, with the bias that the turns before each start show.
+    """Return a model with a gyro and its constants, with the bias that the turns before each time show.
 
     Parameters
     ----------
-    constants : its bias is the bias before the drive; `std_radps` : its standard deviation
+    constants : constants with the bias that is known before the drive
+    std_radps : standard deviation of this bias [rad/s]
     """
     path = predicted_path(past, fitted, constants)
     lines = past_lines(past.track, lambda rows: path(past.track.t[rows])[0], (0.0, std_radps))

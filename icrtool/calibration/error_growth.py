@@ -1,9 +1,9 @@
-"""How the error of a motion model grows along a path, and its forecast for a path that is driven without GNSS.
+"""Growth of the error of a motion model along a path, and forecast of the error on a path without GNSS.
 
-The position error of a drive without GNSS has two parts. The first part comes from the covariance of the parameters; it
-is carried to the path by derivatives. The second part comes from effects that the model leaves out. Six sources of
-error describe it, each with a variance: the heading at the start, a constant error of the turn rate, a proportional
-error of the turns, a random walk of the turn rate, a proportional error of the speed, a random walk of the speed.
+The position error of a drive without GNSS has two parts. The first part follows from the covariance of the parameters
+by the derivatives of the path. The second part comes from effects that the model leaves out. Six sources of error
+describe it, each with a variance: the heading at the start, a constant error of the turn rate, a proportional error of
+the turns, a random walk of the turn rate, a proportional error of the speed, a random walk of the speed.
 `icrtool.calibration.held_out` measures the variances.
 """
 
@@ -57,7 +57,8 @@ class Spread(NamedTuple):
 
     Attributes
     ----------
-    heading : (w, c) [rad^2]; xx, xy, yy : (w, c) [m^2], forward and right; c sources, or one column of all together
+    heading : (w, c) [rad^2]; xx, xy, yy : (w, c) [m^2], forward and right; c is the number of sources, or 1 for all
+        sources together
     """
 
     heading: Floats
@@ -66,18 +67,22 @@ class Spread(NamedTuple):
     yy: Floats
 
     def combined(self, variances: Floats) -> Spread:
-        """Return the moments (w, 1) for variances (c,) of the sources."""
+        """Return the moments (w, 1) of all sources together, for variances (c,) of the sources."""
         return Spread(*((moments @ variances)[:, None] for moments in self))
 
     def plus(self, other: Spread) -> Spread:
-        """Return the moments of independent errors together."""
+        """Return the moments of the sum of two independent errors."""
         return Spread(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 class PathErrors(NamedTuple):
-    """Motion in windows by a model: moved (w,) forward + j right [m], turned (w,) [rad], and moments of its errors.
+    """Motion in windows by a model, and moments of its errors.
 
-    `of_parameters` has one column, `of_sources` one for each source.
+    Attributes
+    ----------
+    moved : complex (w,) displacement, forward + j right [m]; turned : (w,) [rad]
+    of_parameters : moments by errors of the parameters, one column
+    of_sources : moments by a unit variance of each source, a column for each source
     """
 
     moved: Complexes
@@ -89,10 +94,11 @@ class PathErrors(NamedTuple):
 def path_errors(
     windows: Windows, fitted: FittedModel, width_m: float, constants: LogConstants = NO_CONSTANTS
 ) -> PathErrors:
-    """Return displacement and turn of windows by a model, and how errors of its parameters and of each source spread.
+    """Return displacement and turn of windows by a model, and the moments of their errors.
 
     Parameters
     ----------
+    fitted, width_m : the model, and the track width b [m]
     constants : constants of the recording
     """
     steps = windows.track
@@ -100,7 +106,7 @@ def path_errors(
     motion = wheel_motion(steps.v_left, steps.v_right, width_m, gyro)
     fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
     fixed[OMEGA] += constants.gyro_bias_radps
-    # the sources act along the whole path, not only at the ends of the windows
+    # The sources act along the whole path, not only at the ends of the windows.
     of_start, of_end = (steps.place_t[rows] + constants.wheels_later_s for rows in (windows.begin, windows.end))
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
     path = path_at(steps, lambda rows: (fixed[:, rows], axes, columns[:, rows]), fitted.parameters, at)
@@ -124,6 +130,7 @@ def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread
     middle = (place[1:] + place[:-1]) / 2
 
     def between(values: Values) -> Values:
+        """Return the sum of values between the knots of each window."""
         sums = np.concatenate([np.zeros(1, values.dtype), np.cumsum(values)])
         difference: Values = sums[e] - sums[s]
         return difference
@@ -139,7 +146,8 @@ def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread
     ]
     driven_m, first = np.abs(step), between(np.abs(step) * middle)
     zero = between(driven_m)
-    # sum of q (S_e - S_u)(S_e - S_u)^T along the path, as squared length and as the square of the complex number
+    # The sum of q (S_e - S_u)(S_e - S_u)^T along the path is computed as squared length and as square of a complex
+    # number.
     size = (
         zero * np.abs(place[e]) ** 2 - 2.0 * (np.conj(place[e]) * first).real + between(driven_m * np.abs(middle) ** 2)
     )
@@ -155,12 +163,12 @@ def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread
 
 
 def _from_squares(heading: Floats, size: Floats, square: Floats) -> Spread:
-    """Return moments from the sums of |z|^2 and of z^2."""
+    """Return the moments of errors z whose sums of |z|^2 and of z^2 are `size` and `square`."""
     return Spread(heading, (size + square.real) / 2, square.imag / 2, (size - square.real) / 2)
 
 
 def radius_of_share(spread: Spread, share: float) -> Floats:
-    """Return the radius (w,) [m] that holds a share of the errors, normal with the moments (w, 1); bisection."""
+    """Return the radius (w,) [m] that holds a share of normal errors with the moments (w, 1), by bisection."""
     across = _directions(spread)
     low, high = np.zeros(len(across)), 6.0 * np.sqrt(across.max(axis=1))
     for _ in range(BISECTIONS):
@@ -177,7 +185,7 @@ def mean_error(spread: Spread) -> Floats:
 
 
 def _directions(spread: Spread) -> Floats:
-    """Return the squared length (w, `ANGLES`) of a quarter of the unit circle by the square root of a covariance."""
+    """Return the squared lengths (w, `ANGLES`) of unit vectors of a quarter circle times the root of the covariance."""
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     middle, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     large, small = middle + apart, np.maximum(middle - apart, 0.0)
@@ -186,7 +194,14 @@ def _directions(spread: Spread) -> Floats:
 
 
 def fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats, missed: Complexes) -> Floats:
-    """Return the variances (`SOURCES`,) that explain the squared errors of windows, less the part of the parameters."""
+    """Return the variances (`SOURCES`,) that best explain the squared errors of windows.
+
+    Parameters
+    ----------
+    length : (w,) length of each window [m]; each length has the same weight
+    sources, known : moments by unit variances of the sources, and by errors of the parameters
+    turned, missed : (w,) errors of the turn [rad], and of the displacement, forward + j right [m]
+    """
     matrix, y = np.zeros((SOURCES, SOURCES)), np.zeros(SOURCES)
     kinds = (
         (sources.heading, known.heading, turned**2),
@@ -204,11 +219,12 @@ def fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats
 
 
 def solve_nonnegative(matrix: Floats, y: Floats) -> Floats:
-    """Return x >= 0 (n,) that minimises x matrix x / 2 - y x; matrix is positive semidefinite, n is small.
+    """Return x >= 0 (n,) that minimises x M x / 2 - y x; M (n, n) is positive semidefinite, and n is small.
 
     Notes
     -----
-    All 2^n choices of the values above zero are solved. The best solution without a negative value is returned.
+    The equations are solved for each of the 2^n sets of values above zero. The best solution without a negative value
+    is returned.
     """
     size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
     scaled, target = matrix / np.outer(size, size), y / size
@@ -226,9 +242,9 @@ class Forecast(NamedTuple):
 
     Attributes
     ----------
-    distance_m : driven distance; east_m, north_m : position on the path there
-    expected_m, p95_m : mean error, and the distance within which 95 % of the errors are
-    std_east_m, std_north_m, heading_std_deg : one standard deviation
+    distance_m : driven distance; east_m, north_m : position on the path at this distance
+    expected_m, p95_m : mean error, and the error that 95 % of the errors do not exceed
+    std_east_m, std_north_m, heading_std_deg : standard deviations of position and heading
     """
 
     distance_m: Floats
@@ -256,24 +272,25 @@ def forecast_plan(
     Raises
     ------
     DataError
-        A path shorter than a metre or with values that are not numbers, or a calibration without sources of error.
+        The path is shorter than a metre or holds values that are not numbers, or the calibration has no sources of
+        error.
     """
     if not (np.abs([north_m, east_m]) <= FURTHEST_M).all():
-        raise DataError("plan", f"a point that is no number, or beyond {FURTHEST_M:g} m", "give metres")
+        raise DataError("plan", f"a point is not a number, or beyond {FURTHEST_M:g} m", "give metres")
     points = np.asarray(north_m, np.float64) + 1j * np.asarray(east_m, np.float64)
     length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
     if not 1.0 <= length[-1] <= LONGEST_PATH_M:
-        raise DataError("plan", f"a path of {length[-1]:.3g} m", f"give 1 m to {LONGEST_PATH_M:g} m")
+        raise DataError("plan", f"the path is {length[-1]:.3g} m long", f"give 1 m to {LONGEST_PATH_M:g} m")
     at = np.linspace(0.0, length[-1], max(round(length[-1] / STEP_M), 10) + 1)
     line = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(points) - 2)
     path = np.interp(at, length, points.real) + 1j * np.interp(at, length, points.imag)
     step = np.diff(path)
     speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[line[:-1]]
     if not ((np.abs(speed) > 0.0) & (np.abs(speed) <= FASTEST_MPS)).all():
-        why = f"a speed that is zero, no number, or beyond {FASTEST_MPS:g} m/s"
+        why = f"a speed is zero, not a number, or beyond {FASTEST_MPS:g} m/s"
         raise DataError("plan", why, "give speed_mps in m/s, negative in reverse")
     speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_PLAN_MPS)
-    # A corner of the plan is driven as a curve over one track width, not on the spot: the speeds are averaged over it.
+    # A corner is driven as a curve over one track width: the directions are averaged over this distance.
     width = max(round(calibration.width_m / STEP_M), 1)
     padded = np.pad(unwrapped(np.angle(step * np.sign(speed))), (width // 2, width - 1 - width // 2), mode="edge")
     direction = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
@@ -289,19 +306,20 @@ def forecast_plan(
 
 
 def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Forecast:
-    """Return the errors of driving the path of a recording again, with its wheel speeds (and gyro)."""
+    """Return the errors along the path of a recording, with its wheel speeds and, if `with_gyro`, its gyro."""
     return _along(calibration, recording.track, steps_of(recording), with_gyro=with_gyro)
 
 
 def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
-    """Return the speeds of the sides (n,) [m/s] that make a speed ahead [m/s] and a turn rate [rad/s] by a model.
+    """Return left and right speeds (n,) [m/s] for which a model gives a forward speed [m/s] and a turn rate [rad/s].
 
     Notes
     -----
-    The model's matrix from (v, w) to (v_x, omega) is inverted. Nonlinear terms are evaluated at the last iteration.
+    Newton steps in v and w, with derivatives of v_x and omega by differences.
     """
 
     def ahead_and_turn(v: Floats, w: Floats) -> Floats:
+        """Return v_x and omega (2, n) of the model."""
         return fitted.twist(wheel_motion(v + w * width_m / 2.0, v - w * width_m / 2.0, width_m))[[VX, OMEGA]]
 
     v, w = speed.copy(), turn.copy()
@@ -318,10 +336,10 @@ def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Float
 
 
 def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: bool) -> Forecast:
-    """Return the forecast after each metre of a track; `steps` are its wheel samples as they are integrated."""
+    """Return the forecast after each metre of a track; `steps` is the track with joined wheel samples."""
     metres = np.arange(1.0, np.floor(track.distance[-1]) + 1.0)
     if not len(metres):
-        raise DataError("path", f"{track.distance[-1]:.2f} m long", "a forecast needs a metre at least")
+        raise DataError("path", f"is {track.distance[-1]:.2f} m long", "a forecast needs at least a metre")
     rows = np.searchsorted(track.distance, metres)
     windows = Windows(steps, np.zeros_like(rows), rows, metres)
     spread, expected, p95 = forecast_errors(calibration, windows, with_gyro=with_gyro)
@@ -336,7 +354,13 @@ def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: b
 
 
 def forecast_errors(calibration: Calibration, windows: Windows, *, with_gyro: bool) -> tuple[Spread, Floats, Floats]:
-    """Return moments, expected and 95 % error (w,) [m] of windows of a drive."""
+    """Return the moments, the expected error and the 95 % error (w,) [m] in windows of a drive.
+
+    Raises
+    ------
+    DataError
+        The calibration has no sources of error.
+    """
     fitted, sources = calibration.fitted, calibration.error_sources
     if with_gyro and calibration.gyro is not None and (turned := calibration.fitted_with_gyro) is not None:
         fitted, sources = turned, calibration.gyro.error_sources

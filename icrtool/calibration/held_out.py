@@ -1,11 +1,12 @@
-"""Errors of the motion models on recordings, or parts of one recording, that the models were not fitted to.
+"""Errors of motion models on recordings, or on parts of one recording, that the models were not fitted to.
 
-Of several recordings each is left out in turn (Stone 1974). In a single recording each trial is predicted by a fit
-without the windows that share distance with the trial (Burman, Chow and Nolan 1994). On recorded drives a further
-distance of 5 or 10 m between trial and windows changed no error.
+Each of several recordings is left out in turn (Stone 1974). In a single recording, each trial is predicted by a fit
+without the windows that share distance with the trial (Burman, Chow and Nolan 1994). On recorded drives, a further
+distance of 5 or 10 m between the trial and the windows of the fit changed no error.
 
 Held-out windows of several lengths also show how the errors of a model grow (`icrtool.calibration.error_growth`). The
-quantiles are scaled so that they hold in these windows. The errors of the controller's model are measured there, too.
+quantiles are scaled so that they hold in these windows. The errors of the controller's model are measured in these
+windows, too.
 """
 
 from __future__ import annotations
@@ -48,13 +49,14 @@ SHORTEST_BLOCK_M, FEWEST_FOLD_BLOCKS, MOST_FOLD_BLOCKS = 25.0, 3, 5
 """Shortest block of distance of a single drive [m], and smallest and largest number of blocks."""
 
 STRIP_M = 5.0
-"""Shortest strip of distance [m]. One fit predicts all trials from one strip to another, to save time."""
+"""Shortest strip of distance [m]. To save time, one fit predicts all trials that begin in one strip and end in
+another."""
 
 MOST_STRIPS = 2
 """Largest number of strips in a block."""
 
 HELD_OUT = (NO_SLIP, CONTROLLER, RECOMMENDED)
-"""The rows of a held-out table. A row with a gyro has the same name with ``_gyro`` at the end."""
+"""Names of the rows of a held-out table. The name of a row with a gyro ends in ``_gyro``."""
 
 GYRO_SUFFIX = "_gyro"
 """End of the name of a row with a gyro."""
@@ -63,16 +65,16 @@ TOO_SHORT = "too short to fit on one part and test on another"
 """Consequence of a drive that is too short, for errors."""
 
 TWIST_OVER_M = 1.0
-"""Length of the windows over which velocities are averaged for their errors [m]."""
+"""Length of the windows in which errors of velocities are measured [m]."""
 
 LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 """Lengths of the windows that show how errors grow [m]."""
 
 ALWAYS_TO_M = 20.0
-"""Largest length of held-out windows that is always compared [m]."""
+"""Length up to which held-out windows are always compared [m]."""
 
 FEWEST_STRETCHES = 10
-"""Number of separate stretches of a longer length that the drives must hold. Otherwise this length is not compared."""
+"""Number of separate stretches of a longer length that the drives must hold. With fewer, the length is not compared."""
 
 SCALED_FROM_M = 5.0
 """Shortest windows that scale the quantiles [m]. In shorter windows the reference's noise exceeds the model's error."""
@@ -81,10 +83,10 @@ FEWEST_HELD_OUT_WINDOWS = 20
 """Number of windows of `SCALED_FROM_M` or more below which the growth of errors is not measured."""
 
 NORMAL_STRETCHES = 10
-"""Weight of the assumption of normal errors, as a number of independent stretches.
+"""Number of independent stretches that the assumption of normal errors counts as.
 
-The measured quantile of n stretches has the weight n / (n + 10). With 10 stretches its uncertainty equals the spread of
-this quantile between robots."""
+The measured quantile of n stretches has the weight n / (n + 10), because the uncertainty of a quantile of 10 stretches
+equals the spread of this quantile between robots."""
 
 SMALLEST_VARIANCE = 1e-6
 """Smallest variance that is stated to a controller, in the square of its unit."""
@@ -99,7 +101,8 @@ class HeldOutRow:
 
     Attributes
     ----------
-    folds : errors of each fold, by horizon; together : errors of all trials
+    name : name of the row
+    folds : errors in each fold, by horizon; together : errors in all trials
     """
 
     name: str
@@ -107,12 +110,12 @@ class HeldOutRow:
     together: Summary
 
     def within(self, horizons_m: Sequence[float], budget_m: float) -> BudgetDistance | None:
-        """Return how far p95 of all trials stays within a budget [m]; None without trials."""
+        """Return the distance up to which p95 of all trials stays within a budget [m]; None without trials."""
         reached = within_budget(np.array(horizons_m), self.together.p95, budget_m)
         return None if reached is None else BudgetDistance(self.name, budget_m, *reached)
 
     def worst(self, column: str, h: int) -> float:
-        """Return the largest ``p95`` or ``expected`` over folds at a horizon; NaN without trials."""
+        """Return the largest ``p95`` or ``expected`` [m] of the folds at horizon number `h`; NaN without trials."""
         values = np.array([getattr(fold, column)[h] for fold in self.folds])
         values = values[np.isfinite(values)]
         return float(values.max()) if len(values) else float("nan")
@@ -124,9 +127,11 @@ class HeldOut:
 
     Attributes
     ----------
-    folds : the recordings; of a single recording, blocks of distance
+    recordings : the recordings
+    horizons_m : distances of the trials [m]
+    folds : the recordings; of a single recording, its blocks of distance
     trials : trials of each recording
-    fits : fits to all recordings together, by model name
+    fits : fits to all recordings together, by the name of the model
     """
 
     recordings: tuple[Recording, ...]
@@ -137,7 +142,7 @@ class HeldOut:
 
     @cached_property
     def scores(self) -> tuple[HeldOutRow, ...]:
-        """Errors in the trials of all recordings, one row per model."""
+        """Errors in the trials of all recordings, a row for each model."""
         fold_of = []
         for i, (trials, recording) in enumerate(zip(self.trials, self.recordings, strict=True)):
             own_folds = [fold for fold in self.folds if fold.recording == i]
@@ -154,7 +159,7 @@ class HeldOut:
 
     @cached_property
     def error_windows(self) -> tuple[tuple[int, Windows], ...]:
-        """Windows of `LENGTHS_M` and `TWIST_OVER_M`, with the number of their recording; a short recording has none."""
+        """Number of each recording, and its windows of `LENGTHS_M` and `TWIST_OVER_M`; short recordings have none."""
         pooled, windows = totals_of(*self.recordings), []
         for i, recording in enumerate(self.recordings):
             with suppress(DataError):
@@ -163,7 +168,7 @@ class HeldOut:
 
     @property
     def has_gyro(self) -> bool:
-        """Whether there are rows with a gyro: every recording has one."""
+        """Whether there are rows with a gyro, because every recording has a gyro."""
         return f"{RECOMMENDED}{GYRO_SUFFIX}" in self.fits
 
     @property
@@ -173,11 +178,11 @@ class HeldOut:
         return (*HELD_OUT, *turned)
 
     def score(self, name: str) -> HeldOutRow:
-        """Return the row of a model by its name."""
+        """Return the row of this name."""
         return next(score for score in self.scores if score.name == name)
 
     def without(self, name: str, fold: Fold) -> Prediction | None:
-        """Return the model and constants of a row, fitted without a fold; None where too little is left to fit it."""
+        """Return the model and constants of a row, fitted without a fold; None if too little data are left."""
         if name == NO_SLIP:
             return self.fits[NO_SLIP].fitted, NO_CONSTANTS
         base = name.removesuffix(GYRO_SUFFIX)
@@ -189,12 +194,15 @@ class HeldOut:
         return controller_model(solution[0], recording.lever, recording.width_m), solution[1]
 
     def errors(self, name: str, i: int, trials: Trials) -> TrialErrors:
-        """Return the errors of a row in trials of recording i, each predicted without the fold that it touches."""
+        """Return the errors (k, h) of a row in trials of recording i, each predicted without the fold it touches."""
         steps = self.fits[RECOMMENDED].pool.windows[i].track
         return errors_without(self.recordings[i], trials, self.folds, i, partial(self.without, name), steps)
 
     def path(self, name: str, i: int, start: int, end: int) -> OpenLoopPath | None:
-        """Return the path of a row from one state of recording i to another, without the fold that it touches."""
+        """Return the path of a row between two states of recording i, predicted without the fold that it touches.
+
+        None if too little data are left for a fit.
+        """
         recording = self.recordings[i]
         ends = (recording.track.distance[row : row + 1] for row in (start, end))
         ((fold, _),) = left_out(self.folds, i, *ends)
@@ -204,7 +212,10 @@ class HeldOut:
 
 
 def path_between(recording: Recording, prediction: Prediction, steps: Track, start: int, end: int) -> OpenLoopPath:
-    """Return the path that a model predicts between two states of a recording; `steps`: its wheel samples, joined."""
+    """Return the path that a model predicts between two states of a recording.
+
+    `steps` is the track of the recording with joined wheel samples.
+    """
     track, rows = recording.track, np.arange(start, end + 1)
     near = steps.around(track.t[start], track.t[end])
     turned, place = predicted_path(recording, *prediction, near)(track.t[rows])
@@ -214,12 +225,12 @@ def path_between(recording: Recording, prediction: Prediction, steps: Track, sta
 
 
 def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
-    """Return the folds to leave out in turn: each recording, or contiguous blocks of distance of a single recording.
+    """Return the folds that are left out in turn: the recordings, or contiguous blocks of a single recording.
 
     Raises
     ------
     DataError
-        A single drive is too short to hold anything out.
+        A single recording is shorter than two trials of `CHOICE_HORIZON_M`.
     """
     if len(recordings) > 1:
         return tuple(Fold(recording.name, i, i, -np.inf, np.inf) for i, recording in enumerate(recordings))
@@ -236,8 +247,9 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
 
     Parameters
     ----------
-    folds : of `plan_folds`
-    start_m, end_m : path lengths (k,) at the trials' starts and ends
+    folds : result of `plan_folds`
+    recording : number of the recording
+    start_m, end_m : (k,) path lengths at the starts and ends of the trials [m]
     """
     if not len(start_m):
         return
@@ -262,12 +274,12 @@ def errors_without(
     recording: Recording, trials: Trials, folds: Sequence[Fold], i: int, without: Callable[[Fold], Prediction | None],
     steps: Track | None = None,
 ) -> TrialErrors:  # fmt: skip
-    """Return the errors of trials of recording i, each predicted without its fold; NaN where no model is given.
+    """Return the errors (k, h) of trials of recording i, each predicted without its fold; NaN if there is no model.
 
     Parameters
     ----------
-    without : gives the model for a fold, None where too little is left to fit it
-    steps : the wheel samples, joined; default: single samples
+    without : returns the model that is fitted without a fold; None if too little data are left
+    steps : track of the recording with joined wheel samples; default: single samples
     """
     track, distance = recording.track, recording.track.distance
     errors = TrialErrors.none(trials.ends.shape)
@@ -286,12 +298,12 @@ def errors_without(
 
 
 def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MODELS)) -> dict[str, PooledFit]:
-    """Return motion models fitted to recordings, with a gyro too if every recording has a gyro.
+    """Return motion models that are fitted to recordings, by name; also with a gyro if every recording has a gyro.
 
     Raises
     ------
     DataError
-        Too short a drive.
+        A recording is too short.
     """
     pooled = totals_of(*recordings)
     pool = Pool(
@@ -300,7 +312,7 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
     )
     fits = {name: pool.fit(MODELS[name]) for name in names}
     if FIVE in fits:
-        # All logs have the clocks of one robot, so many logs show a constant delay no better than a single log.
+        # All recordings have the clocks of one robot, so several of them show its delay no better than one.
         off = float(np.sqrt(np.mean([recording.x_clock_std_m**2 for recording in recordings])))
         fits[FIVE] = fits[FIVE].with_clock_error(off)
     if all(recording.track.gyro is not None for recording in recordings):
@@ -309,16 +321,17 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
 
 
 def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HELD_OUT_HORIZONS_M) -> HeldOut:
-    """Return the motion models fitted to recordings, each tested on data that it was not fitted to.
+    """Return motion models that are fitted to recordings, with their tests on data that they were not fitted to.
 
     Parameters
     ----------
     recordings : at least one
+    horizons_m : distances of the trials [m]
 
     Raises
     ------
     DataError
-        Too short a drive, or too few windows outside a fold.
+        A recording is too short, or too few windows lie outside a fold.
     """
     folds = plan_folds(recordings)
     fits = fit_models(recordings)
@@ -333,7 +346,7 @@ def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HELD
 def _left_out_windows(
     table: HeldOut, name: str, lengths_m: Sequence[float]
 ) -> Iterator[tuple[int, Windows, Prediction]]:
-    """Yield the number of a recording, windows of it with the steps around them, and the model fitted without them."""
+    """Yield the number of a recording, windows of it with the steps around them, and a model fitted without them."""
     for i, windows in table.error_windows:
         chosen = np.flatnonzero(np.isin(windows.length_m, lengths_m))
         start_m, end_m = (windows.track.distance[rows[chosen]] for rows in (windows.begin, windows.end))
@@ -346,18 +359,14 @@ def _left_out_windows(
 
 
 def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
-    """Return the sources of error of a row of a held-out table, from windows that the row was not fitted to.
-
-    Returns
-    -------
-    None where too few windows were left out.
+    """Return the sources of error of a row, from windows that the row was not fitted to; None for too few windows.
 
     Notes
     -----
     The variances are non-negative least squares of the squared errors; each length and direction has the same weight.
-    The factors come from split conformal prediction (Vovk et al. 2005), where windows of 10 m count as independent.
-    Their logarithm is shrunk towards zero (James and Stein 1961), because a short drive shows only its largest error,
-    not a quantile.
+    The factors come from split conformal prediction (Vovk et al. 2005); windows of 10 m count as independent. Their
+    logarithm is shrunk towards zero (James and Stein 1961), because a short drive shows its largest error and no
+    quantile.
     """
     of_logs: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
     tested = [np.empty((0, 3))]
@@ -388,18 +397,13 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     level = min(95.0 * (1.0 + 1.0 / count), 100.0)
     share = np.percentile(error / np.maximum(error_growth.radius_of_share(spread, 0.95)[far], 1e-9), level)
     mean = error.mean() / max(float(error_growth.mean_error(spread)[far].mean()), 1e-9)
-    # ratio of measured to normal error: with fewer stretches it is drawn closer to 1
+    # The ratio of measured to normal error is moved towards 1, the more the fewer stretches there are.
     factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
     return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
 
 
 def measure_controller_errors(table: HeldOut, *, has_gyro: bool) -> ControllerErrors | None:
-    """Return the errors of the controller's model in each fold, fitted without this fold.
-
-    Returns
-    -------
-    None where too few windows were left out.
-    """
+    """Return the errors of the controller's model in each fold, fitted without this fold; None for too few windows."""
     (far, _), (near, stretches) = (_window_errors(table, CONTROLLER, at) for at in (CHOICE_HORIZON_M, TWIST_OVER_M))
     if min(len(far), len(near)) < FEWEST_TESTED or CHOICE_HORIZON_M not in table.horizons_m:
         return None
@@ -426,19 +430,19 @@ def measure_controller_errors(table: HeldOut, *, has_gyro: bool) -> ControllerEr
 
 
 def _variances(errors: Floats) -> tuple[float, float, float]:
-    """Return mean squares (3,), never zero."""
+    """Return the mean squares (3,) of errors (m, 3), at least `SMALLEST_VARIANCE`."""
     along, across, heading = np.maximum((errors**2).mean(axis=0), SMALLEST_VARIANCE).tolist()
     return along, across, heading
 
 
 def _variance_stds(errors: Floats, stretches: int) -> tuple[float, float, float]:
-    """Return the standard deviations of `_variances` (3,); windows overlap, so only separate stretches are counted."""
+    """Return the standard deviations of `_variances` (3,). Windows overlap, so only separate stretches are counted."""
     along, across, heading = ((errors**2).std(axis=0) / math.sqrt(max(stretches, 1))).tolist()
     return along, across, heading
 
 
 def _shares(missed: Floats, first: Floats, second: Floats) -> tuple[float, float]:
-    """Return a, b >= 0 such that a first^2 + b second^2 fits missed^2 by least squares."""
+    """Return a and b, at least `SMALLEST_VARIANCE`, for which a first^2 + b second^2 fits missed^2 by least squares."""
     columns = np.column_stack([first**2, second**2])
     a, b = np.maximum(
         error_growth.solve_nonnegative(columns.T @ columns, columns.T @ missed**2), SMALLEST_VARIANCE
@@ -451,7 +455,8 @@ def _window_errors(table: HeldOut, name: str, length_m: float) -> tuple[Floats, 
 
     Returns
     -------
-    (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m]; the number
+    errors : (m, 6) error along, across [m] and in heading [rad], duration [s], turn [rad], length [m]
+    stretches : number of separate stretches
     """
     rows, stretches = [np.empty((0, 6))], set[tuple[int, float]]()
     for i, windows, predicted in _left_out_windows(table, name, [length_m]):

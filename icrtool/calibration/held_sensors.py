@@ -1,9 +1,9 @@
 """Constants of the sensors in a calibration: measured in each of its logs, pooled, and held in a further log.
 
-A robot's sensors are installed once. Heading offset and delays of a log are the sum of the corrections before the fit
-and the remainder that the windows show, so that logs with different corrections can be compared. A calibration holds
-their mean over its logs, with the spread between drives. The bias of a gyro changes with its temperature: a row with a
-gyro learns it from the drive before each start.
+The sensors of a robot are installed once. Heading offset and delays of a log are the sum of the corrections before the
+fit and the remainders that the windows show, so that logs with different corrections can be compared. A calibration
+holds their mean over its logs, with the spread between drives. The bias of a gyro changes with its temperature, so a
+row with a gyro learns the bias from the drive before each start.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ from icrtool.records import calibration_document as documents
 from icrtool.records.notes import Note, note
 
 FEWEST_POOLED = 3
-"""Number of logs from which on the spread between drives is estimated."""
+"""Smallest number of logs from which the spread between drives is estimated."""
 
 BETWEEN_DRIVES_STD = LogConstants(math.radians(0.5), 0.02, GYRO_START_STD[1], 0.02)
 """Standard deviations of the constants between drives of one robot, before its logs show them [rad, s, rad/s, s].
 
-An installation does not change. What remains is how ground and speed change the robot's response to its wheels, and the
-temperature of a gyro."""
+The installation does not change between drives. The robot's response to its wheels changes with ground and speed, and
+the bias of a gyro with its temperature."""
 
 SENSORS_CONTRADICT = "sensors_contradict_calibration"
 """Code of a note about a constant that a log contradicts."""
 
 SENSOR_SIGMAS = 3.0
-"""Difference between a held constant and a log's own, in standard deviations, from which on the log contradicts it."""
+"""Difference between a held constant and the constant of a log above which the log contradicts it, in standard
+deviations."""
 
 _TO_DOCUMENT = np.array([math.degrees(1.0), -1.0, math.degrees(1.0), 1.0])
 """Factors from `LogConstants` to the numbers of `SensorConstants`."""
@@ -44,11 +45,11 @@ _TO_DOCUMENT = np.array([math.degrees(1.0), -1.0, math.degrees(1.0), 1.0])
 def sensors_of(
     recording: Recording, windows: Windows, fitted: FittedModel, turned: FittedModel | None = None
 ) -> documents.LogSensors:
-    """Return the constants of a recording's sensors, corrections before the fit included.
+    """Return the constants of a recording's sensors, with the corrections before the fit.
 
     Parameters
     ----------
-    windows : of the recording
+    windows : windows of the recording
     fitted, turned : models of the calibration, with wheels alone and with a gyro
     """
     of_models = [
@@ -59,7 +60,7 @@ def sensors_of(
 
 
 def measured_in(recording: Recording, windows: Windows, fitted: FittedModel) -> KnownConstants:
-    """Return the constants that a recording's sensors had before any correction, for a model's parameters."""
+    """Return the constants that a recording's sensors had before any correction, for the parameters of a model."""
     constants = measured_constants(windows, fitted, recording.width_m)
     return KnownConstants(recording.corrected.plus(constants.mean), constants.std)
 
@@ -90,9 +91,9 @@ def pooled_constants(
 
     Parameters
     ----------
-    heading_source : of the further drive. A heading of another source has another offset, which is not used. None: the
-        source of the logs, if it is one
-    with_gyro : for the model with a gyro
+    heading_source : source of the heading in the further drive. Offsets of headings of another source are not used.
+        None: the source of the logs, if all have the same source
+    with_gyro : return the constants for the model with a gyro
 
     Notes
     -----
@@ -115,7 +116,7 @@ def pooled_constants(
             if math.isfinite(constants.mean[column]) and not (of_offset and source != heading_source)
         ])  # fmt: skip
         if of_offset and len(known):
-            # angles about the first one
+            # Angles are unwrapped about the first one.
             known[:, 0] -= 2.0 * np.pi * np.round((known[:, 0] - known[0, 0]) / (2.0 * np.pi))
         pairs.append(_further(known, usual_std) if len(known) else (math.nan, math.nan))
     mean, std = zip(*pairs, strict=True)
@@ -123,7 +124,7 @@ def pooled_constants(
 
 
 def _further(values_and_stds: Floats, usual_std: float) -> tuple[float, float]:
-    """Return mean and standard deviation of a further drive, from the values and deviations of drives (k, 2)."""
+    """Return mean and standard deviation for a further drive, from values and standard deviations of drives (k, 2)."""
     (values, std), usual = values_and_stds.T, usual_std**2
     variances, between = std**2, usual
     if len(values) >= FEWEST_POOLED:
@@ -135,7 +136,7 @@ def _further(values_and_stds: Floats, usual_std: float) -> tuple[float, float]:
 
 
 def remaining_constants(total: KnownConstants, corrected: LogConstants) -> KnownConstants:
-    """Return constants minus the corrections that were made before; NaN where they are not known."""
+    """Return constants minus the corrections that were made before; NaN where a constant is not known."""
     return total._replace(mean=total.mean.minus(corrected))
 
 
@@ -145,19 +146,19 @@ CONSTANT_WORDS = {
     "gyro_bias_degps": ("gyro bias", "°/s", 2),
     "gyro_delay_s": ("delay of the gyro behind the wheels", " s", 3),
 }
-"""Words, unit and decimals of each of `SensorConstants`."""
+"""Words, unit and number of decimals of each field of `SensorConstants`."""
 
 LEARNED = "gyro_bias_degps"
-"""The constant that a row learns from the drive before each start in place of holding it."""
+"""Field of `SensorConstants` that a row learns from the drive before each start, and does not hold."""
 
 
 def words_of(names: Iterable[str]) -> str:
-    """Return the words of some of `SensorConstants`."""
+    """Return the words for some fields of `SensorConstants`."""
     return ", ".join(CONSTANT_WORDS[name][0] for name in names)
 
 
 def constant_text(constants: documents.SensorConstants, name: str) -> str:
-    """Return a constant with its standard deviation and unit; empty where it is not known."""
+    """Return a constant with its standard deviation and unit as text; empty if the constant is not known."""
     constant: documents.MeasuredConstant | None = getattr(constants, name)
     _, unit, digits = CONSTANT_WORDS[name]
     return "" if constant is None else f"{constant.value:+z.{digits}f} ± {constant.std:.{digits}f}{unit}"
@@ -168,8 +169,9 @@ def contradictions(row: str, sensors: documents.HeldSensors, among: Iterable[str
 
     Parameters
     ----------
-    row : its name
-    among : of `SensorConstants`
+    row : name of the row
+    sensors : constants that the row holds, and that the log shows
+    among : names of the fields of `SensorConstants` that are compared
     """
     notes = list[Note]()
     if sensors.measured is None:
