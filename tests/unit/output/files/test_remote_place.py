@@ -146,7 +146,7 @@ def test_a_run_at_an_address_is_that_on_disk_and_its_report_is_added_there(store
         assert run(monkeypatch, capfd, "calibrate", place, "-o", f"{place[-3:]}{len(place)}.json", "-q")[0] == 0
     status, refusal = run(monkeypatch, capfd, "report", "s3://field/runs/one")
     assert status == 1
-    assert "s3://field/runs/one: is a run at an address; copy it to a place on disk" in refusal
+    assert "s3://field/runs/one: is a run at an address; copy it to a disk" in refusal
     assert len(refusal.splitlines()) == 1
     said = [run(monkeypatch, capfd, "export", "--for", "kml", place)[1] for place in ("s3://field/runs/one", "one")]
     assert said[0] == said[1]
