@@ -1,7 +1,7 @@
 """Numbers of a drive for `robot_localization`: covariances, process noise, heading offset, place of the antenna.
 
-Frames of REP-103: x forward, y left, yaw counter-clockwise from east. Every number has its source, and its standard
-deviation where one is known; numbers that the drive does not show are listed with the reason.
+Frames follow REP-103: x forward, y left, yaw counter-clockwise from east. Every number has its source and, if
+it is known, its standard deviation. Numbers that the drive does not show are listed with the reason.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Estimate(NamedTuple):
 
 
 class AntennaPlace(NamedTuple):
-    """The antenna from the body origin, forward and left [m], and how it is known."""
+    """Position of the antenna from the body origin, forward and left [m], and the source of it."""
 
     forward_m: float
     left_m: float
@@ -55,13 +55,14 @@ class Localization(NamedTuple):
 
     Attributes
     ----------
-    twist : variances of the wheels' v_x, v_y [m^2/s^2] and yaw rate [rad^2/s^2], of one message
-    gyro_rate : variance of the gyro's yaw rate [rad^2/s^2], None without a gyro
-    process : variances for each second, by the name of its state
-    declination_rad, yaw_offset_rad : angles that its navsat_transform_node adds to the yaw of the IMU; None where not
-        shown
-    wheel_topic, imu_topic : topics of the log, empty where it has none of the types
-    left_out : parameter and reason of each number that the drive does not show
+    twist : variances of v_x, v_y [m^2/s^2] and yaw rate [rad^2/s^2] in a message of wheel odometry
+    gyro_rate : variance of the yaw rate of the gyro [rad^2/s^2]; None without a gyro
+    process : process noise, as variance for each second, by the name of the state in `robot_localization`
+    declination_rad, yaw_offset_rad : angles that navsat_transform_node adds to the yaw of the IMU; None if the drive
+        does not show them
+    antenna : position of the antenna; None if it is not known
+    wheel_topic, imu_topic : topics of the log; empty if the log has none of the types
+    left_out : parameter and reason for each number that the drive does not show
     """
 
     twist: tuple[Estimate, Estimate, Estimate]
@@ -76,7 +77,7 @@ class Localization(NamedTuple):
 
 
 def localization(calibration: Calibration, run: Run | None = None) -> Localization:
-    """Return the numbers of a calibration, and of the run that it was fitted to where there is one.
+    """Return the numbers of a calibration and, if it is given, of the run that the calibration was fitted to.
 
     Raises
     ------
@@ -86,7 +87,9 @@ def localization(calibration: Calibration, run: Run | None = None) -> Localizati
     errors = calibration.controller_errors
     if errors is None:
         advice = "covariances need a longer drive"
-        raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
+        raise DataError(
+            calibration.name or calibration.log_names(), "too short to measure the growth of errors", advice
+        )
     source = f"held-out errors of the controller's model over {TWIST_OVER_M:g} m"
     stds = errors.twist_variance_std or (None, None, None)
     v_x, v_y, yaw_rate = (
@@ -115,7 +118,7 @@ def localization(calibration: Calibration, run: Run | None = None) -> Localizati
 
 
 def _topics(run: Run) -> tuple[str, str]:
-    """Return the topic of the wheels' odometry and of the gyro, empty where the log has none."""
+    """Return the topics of the wheel odometry and of the gyro; empty if the log has none."""
     wheels = next(
         (stream.topic for stream in run.document.streams if stream.role == "wheels" and _is_odometry(stream)), ""
     )
@@ -123,6 +126,7 @@ def _topics(run: Run) -> tuple[str, str]:
 
 
 def _is_odometry(stream: object) -> bool:
+    """Return whether a stream consists of messages nav_msgs/Odometry."""
     return getattr(stream, "message_type", "") == "nav_msgs/Odometry"
 
 
@@ -131,8 +135,8 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
 
     Notes
     -----
-    In a time dt the filter adds the variance REFERENCE_STEP_S dt sigma^2 (Pentzer 2014, Eq. 30, for any sample rate),
-    and robot_localization adds dt Q.
+    In a time dt the filter adds the variance REFERENCE_STEP_S dt sigma^2 (Pentzer 2014, Eq. 30, for any sample rate).
+    robot_localization adds dt Q.
     """
     used, settings, configured = run.document.filter, run.config.filter, configured_noise(run.config)
     estimates: dict[str, Estimate] = {}
@@ -152,11 +156,11 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
 
 
 def _speed_noise(calibration: Calibration, run: Run) -> dict[str, Estimate]:
-    """Return the process noise of v_x [m^2/s^3] and of the yaw rate [rad^2/s^3]; empty where the drive is too short.
+    """Return the process noise of v_x [m^2/s^3] and of the yaw rate [rad^2/s^3]; empty if the drive is too short.
 
     Notes
     -----
-    robot_localization predicts constant velocities: a change over its period dt has the variance dt Q.
+    robot_localization predicts constant velocities: a change within its period dt has the variance dt Q.
     """
     table = run.table
     interval = np.diff(table.t_s)
@@ -178,6 +182,13 @@ def _speed_noise(calibration: Calibration, run: Run) -> dict[str, Estimate]:
 
 
 def _mean_of_blocks(squares: Floats, block: Ints, lasted_s: float) -> Estimate:
+    """Return the mean of squared changes (n,), with a standard deviation from the means of their blocks.
+
+    Parameters
+    ----------
+    block : (n,) number of the block of each change, from 0
+    lasted_s : time in which the changes happened
+    """
     count = np.bincount(block)
     means = np.bincount(block, weights=squares) / count
     std = float(means.std() / math.sqrt(len(means)))
@@ -185,12 +196,12 @@ def _mean_of_blocks(squares: Floats, block: Ints, lasted_s: float) -> Estimate:
 
 
 def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
-    """Return declination and offset [rad] that make the IMU's yaw count from east, or the reason why there are none.
+    """Return the declination and the offset [rad] with which the IMU's yaw counts from east, and why there are none.
 
     Notes
     -----
-    navsat_transform_node adds both to the yaw. Its declination is counter-clockwise: the negative of the usual one,
-    which is positive where magnetic north lies east of north.
+    navsat_transform_node adds both angles to the yaw. Its declination is counter-clockwise: the negative of the usual
+    declination, which is positive if magnetic north lies east of north.
     """
     sensor, heading = run.sensors.facts.heading_sensor, run.document.heading
     fixes = next((stream.message_type for stream in run.document.streams if stream.role == "gnss"), "")
@@ -222,7 +233,7 @@ def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
 
 
 def _antenna(run: Run) -> tuple[AntennaPlace | None, str]:
-    """Return the position of the antenna, or the reason why it is not known."""
+    """Return the position of the antenna, and the reason if it is not known."""
     forward, right = known_antenna_m(run)
     if forward is not None and right is not None:
         frames = run.config.frames

@@ -1,4 +1,4 @@
-"""Errors on a ground that a calibration was not fitted to: each group of recordings left out in turn."""
+"""Errors on a ground that a calibration was not fitted to: the recordings of each ground are left out in turn."""
 
 from __future__ import annotations
 
@@ -24,21 +24,22 @@ GROUND_HORIZONS_M = (1.0, 2.0, 3.0, 5.0, 7.0, CHOICE_HORIZON_M, 15.0, OTHER_GROU
 """Distances of the errors on other grounds [m]."""
 
 FEWEST_GROUNDS = 2
-"""Number of grounds from which on each can be left out."""
+"""Smallest number of grounds of which each can be left out."""
 
 
 def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -> tuple[GroundScore, ...]:
-    """Return the errors on each ground of the numbers that were fitted to all other grounds.
+    """Return the errors on each ground, of models that were fitted to all other grounds.
 
     Parameters
     ----------
-    recordings : of one robot
+    recordings : recordings of one robot
     grounds : name of the ground of each recording
 
     Returns
     -------
-    The scores; none for fewer than `FEWEST_GROUNDS` grounds. A ground has no score if it has no trials, or if the other
-    grounds together are too short a drive.
+    tuple of GroundScore
+        Empty for fewer than `FEWEST_GROUNDS` grounds. A ground has no score if it has no trials, or if the recordings
+        of the other grounds are too short for a fit.
     """
     scores: list[GroundScore] = []
     names = list(dict.fromkeys(grounds))
@@ -55,7 +56,7 @@ def leave_grounds_out(recordings: Sequence[Recording], grounds: Sequence[str]) -
 
 
 def _scores(ground: str, recordings: Sequence[Recording], fits: Mapping[str, PooledFit]) -> Iterator[GroundScore]:
-    """Yield the errors in the recordings of a ground, by row and distance."""
+    """Yield the errors in all recordings of a ground, by row and distance."""
     errors: dict[str, list[Floats]] = {}
     for recording in recordings:
         for name, position in _errors(recording, cut_trials(recording, GROUND_HORIZONS_M), fits):
@@ -70,14 +71,14 @@ def _scores(ground: str, recordings: Sequence[Recording], fits: Mapping[str, Poo
 
 
 def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit]) -> Iterator[tuple[str, Floats]]:
-    """Yield rows and their errors (k, h) [m] in trials of a recording."""
+    """Yield the name of each row, and its errors (k, h) [m] in trials of a recording."""
     turned = fits.get(f"{RECOMMENDED}{GYRO_SUFFIX}")
     has_gyro = turned is not None and recording.track.gyro is not None
     windows = cut_windows(recording)
     for suffix in ("", GYRO_SUFFIX) if has_gyro else ("",):
-        five, eight = (fits[f"{name}{suffix}"].fitted for name in (FIVE, RECOMMENDED))
+        five_terms, eight_terms = (fits[f"{name}{suffix}"].fitted for name in (FIVE, RECOMMENDED))
         for name, fitted in (
-            (CONTROLLER, controller_model(five, recording.lever, recording.width_m)), (RECOMMENDED, eight),
+            (CONTROLLER, controller_model(five_terms, recording.lever, recording.width_m)), (RECOMMENDED, eight_terms),
         ):  # fmt: skip
             yield f"{name}{suffix}", _held(recording, trials, fitted, own_constants(windows, fitted, recording.width_m))
     gyro_model = turned.fitted if turned is not None else None
@@ -88,7 +89,7 @@ def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit])
 
 
 def _held(recording: Recording, trials: Trials, fitted: FittedModel, constants: LogConstants) -> Floats:
-    """Return the errors (k, h) [m] of a model that is not fitted again."""
+    """Return the errors (k, h) [m] of a model with its constants in trials of a recording."""
     return errors_without(
         recording, trials, [Fold("", 0, 0, -np.inf, np.inf)], 0, lambda _: (fitted, constants)
     ).position
@@ -97,17 +98,19 @@ def _held(recording: Recording, trials: Trials, fitted: FittedModel, constants: 
 def other_ground_ends(
     scores: Sequence[GroundScore], row: str, budget_m: float
 ) -> tuple[float | None, float | None] | None:
-    """Return the interval of the distance [m] at which a row stays within a budget on a further ground.
+    """Return the interval of the distance [m] over which a row stays within a budget on a further ground.
 
     Parameters
     ----------
-    scores : of `leave_grounds_out`
-    row : its name there
+    scores : result of `leave_grounds_out`
+    row : name of the row
+    budget_m : largest allowed error [m]
 
     Returns
     -------
-    Ends of the 9-of-10 interval; None for an end that stays within the budget at every horizon. None where fewer than
-    `FEWEST_GROUNDS` grounds have the row.
+    tuple or None
+        Ends of the interval that holds the distance in 9 of 10 cases. An end is None if the error stays within the
+        budget at every horizon. None for a row with fewer than `FEWEST_GROUNDS` grounds.
     """
     spread_std = row_of(row).spread.grounds
     by_horizon: dict[float, list[float]] = {}

@@ -1,4 +1,4 @@
-"""Runs as recordings, to which motion models are fitted, and calibrations from one recording or several."""
+"""Runs as recordings for the motion models, and calibrations from one recording or several."""
 
 from __future__ import annotations
 
@@ -48,12 +48,13 @@ from icrtool.records.samples import are_twist
 
 
 def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: float | None = None) -> Recording:
-    """Return a run as motion models see it: wheels, reference, gyro.
+    """Return the recording of a run: wheels, reference and gyro, as the motion models use them.
 
     Parameters
     ----------
-    heading : a measured heading of the run, such as its gyro's; its turn rate is used if it agrees with the reference
-    width_m : track width b to use; default the run's
+    heading : a measured heading of the run, for example of its gyro; its turn rate is used if it agrees with the
+        reference
+    width_m : track width b [m]; default: the track width of the run
 
     Raises
     ------
@@ -62,7 +63,9 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
     """
     width = width_m if width_m is not None else run.track_width_m
     if width is None:
-        raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
+        raise ConfigError(
+            "robot.track_width_m", f"is not known in {run.name}", "fit the log again with it, or with --robot"
+        )
     inputs = run.document.inputs
     left, right = (scale / error for scale, error in zip(run.wheel_scales, run.radius_errors, strict=True))
     plain = Recording(
@@ -82,14 +85,14 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
 
 
 def _corrected(run: Run) -> LogConstants:
-    """Return the constants that were corrected in the streams of a run; an estimated heading has no offset."""
+    """Return the corrections in the streams of a run as constants; an estimated heading has no offset."""
     offset_deg = 0.0 if run.sensors.facts.heading_is_estimated else run.document.heading.applied_offset_deg
     position = run.document.alignment.get("position_delay_s")
     return LogConstants(-math.radians(offset_deg), 0.0 if position is None else -position.applied)
 
 
 def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
-    """Return the antenna's position forward and right [m]; None where neither configuration nor log states it."""
+    """Return the antenna's position forward and right [m]; None if neither the configuration nor the log states it."""
     used, frames = run.sensors.facts.antenna_m, run.config.frames
     in_log = run.sensors.facts.antenna_is_known and frames.antenna_right_m == "auto"
     return (
@@ -99,10 +102,12 @@ def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
 
 
 def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | Literal["auto"] = "auto") -> Recording:
-    """Return a recording with the turn rate of a measured heading; unchanged if the two do not turn together.
+    """Return a recording with the turn rate of a measured heading; without it if heading and reference disagree.
 
     Parameters
     ----------
+    plain : the recording without a turn rate
+    heading : the measured heading
     delay_s : lag of the heading behind the wheels [s]; ``auto``: estimated from the turns of the reference
     """
     if not np.isfinite(heading.angle_rad).all():
@@ -110,6 +115,7 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | 
     t = plain.track.t
 
     def rate(later_s: float) -> Floats:
+        """Return the turn rate (n,) [rad/s] of the heading, read `later_s` after the wheels."""
         rates = np.zeros(len(t))
         for lo in range(0, len(t) - 1, ROWS_AT_ONCE):
             at = t[lo : lo + ROWS_AT_ONCE + 1]
@@ -127,27 +133,27 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | 
 
 
 def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
-    """Return `recording_of` a run with its measured heading of one kind (``gyro`` or ``heading``), if it has one."""
+    """Return the recording of a run with its measured heading of a kind (``gyro`` or ``heading``), if it has one."""
     return recording_of(
         run, next((heading for heading in measured_headings(run) if heading.kind == kind), None), width_m=width_m
     )
 
 
 def gyro_line(recording: Recording) -> PastLines:
-    """Return the line (scale and bias) of a recording's gyro, fitted to the reference of the whole drive."""
+    """Return scale and bias of a recording's gyro, fitted to the reference of the whole drive."""
     gyro = recording.track.gyro
     line = GyroLine(1.0, 0.0, 0.0) if gyro is None else _gyro_line(recording, gyro)
     return PastLines(np.zeros(1, np.int64), np.array([line.scale]), np.array([line.bias_radps]))
 
 
 def _gyro_line(recording: Recording, rate: Floats) -> GyroLine:
-    """Return the line (scale and bias) that maps a turn rate (n,) to the turns of a recording's reference."""
+    """Return scale, bias and lead that map a turn rate (n,) [rad/s] to the turns of a recording's reference."""
     track = recording.track
     return fit_gyro_line(track.t, rate, track.cumulate(rate), track.t, track.heading)
 
 
 class LeftOut(NamedTuple):
-    """A log that a calibration leaves out, and why."""
+    """A log that a calibration leaves out, and the reason."""
 
     name: str
     why: str
@@ -157,7 +163,7 @@ class LeftOut(NamedTuple):
 
 
 class CalibrationResult(NamedTuple):
-    """A calibration, and the held-out table with its errors."""
+    """A calibration, the held-out table with its errors, notes about it, and the logs that it leaves out."""
 
     calibration: Calibration
     table: held_out.HeldOut
@@ -169,11 +175,11 @@ def calibrate_recordings(
     recordings: Sequence[Recording], robot: documents.CalibratedRobot | None = None, findings: tuple[Note, ...] = (),
     grounds: Sequence[str] = (),
 ) -> CalibrationResult:  # fmt: skip
-    """Return the motion models fitted to all recordings, each tested on data that it was not fitted to.
+    """Return the calibration from recordings of a robot, tested on data that it was not fitted to.
 
     Parameters
     ----------
-    recordings : one or many, of one robot
+    recordings : one or more recordings of one robot
     robot : the robot that the calibration states; default: without a name
     findings : notes that a user needs before using the calibration
     grounds : name of the ground of each recording; with two or more names, each ground is left out in turn
@@ -181,22 +187,22 @@ def calibrate_recordings(
     Raises
     ------
     ConfigError
-        Recordings of robots of different width, or one recording twice.
+        The recordings have different track widths, or one recording is given twice.
     DataError
-        Too short a drive.
+        The recordings are too short.
     """
     widths = {recording.width_m for recording in recordings}
     if len(widths) > 1:
         widths_text = ", ".join(f"{width:g} m" for width in sorted(widths))
-        raise ConfigError("robot.track_width_m", f"{widths_text} in the logs given", "calibrate one robot at a time")
+        raise ConfigError("robot.track_width_m", f"is {widths_text} in the given logs", "calibrate one robot at a time")
     with_sum = [recording for recording in recordings if recording.sha256]
     if twice := {
         recording.name for recording in with_sum if sum(recording.sha256 == other.sha256 for other in with_sum) > 1
     }:
-        raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
+        raise ConfigError(min(twice), "is given twice", "name each log once, else it would be tested on itself")
     table = held_out.hold_out(recordings)
     turnless = ", ".join(recording.name for recording in recordings if recording.track.gyro is None)
-    text = f"no gyro that turns with the robot in {turnless}: wheels alone"
+    text = f"{turnless}: no gyro turns with the robot, so the models use the wheels alone"
     notes = (note("gyro_not_used", text),) if turnless else ()
     calibration = calibration_from(table, robot, findings)
     if grounds:
@@ -219,8 +225,10 @@ def calibration_from(
 
     Parameters
     ----------
-    has_gyro : whether the turn rate of the table is measured by a gyro; None: where the table has one. A rate that is
-        derived from a measured heading belongs to this heading and not to the calibration.
+    table : the held-out table
+    robot, findings : as in `calibrate_recordings`
+    has_gyro : whether a gyro measures the turn rate of the table; None: if the table has a turn rate. A turn rate that
+        is derived from a measured heading does not become a part of the calibration
     """
     has_gyro = table.has_gyro if has_gyro is None else has_gyro
     recordings, best = table.recordings, table.fits[RECOMMENDED]
@@ -279,10 +287,15 @@ def calibration_from(
 def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: float) -> float | None:
     """Return the standard deviation of the multiplier between the logs of a calibration; None for one or two logs.
 
+    Parameters
+    ----------
+    width_m : track width b [m]
+    multiplier : the multiplier of all logs together
+
     Notes
     -----
-    The variance between the logs beyond their own uncertainty (`between_variance`) is pooled with the variance of
-    other robots.
+    The variance between the logs beyond their own uncertainty (`between_variance`) is pooled with the variance between
+    drives of other robots.
     """
     if len(table.recordings) < FEWEST_POOLED:
         return None
@@ -296,7 +309,7 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return a function for the errors of a calibration in trials of a recording, with the recording's constants."""
+    """Return a function that gives the errors of a calibration in trials of a recording, with its own constants."""
     fitted = model_for(calibration, recording, with_gyro=with_gyro)
     fit = fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]
@@ -308,47 +321,48 @@ def model_for(calibration: Calibration, recording: Recording, *, with_gyro: bool
 
     Parameters
     ----------
-    with_gyro : the turn rate is the weighted mean with the recording's gyro
+    with_gyro : return the model whose turn rate is the weighted mean of wheels and gyro
 
     Raises
     ------
     ConfigError
-        The calibration is of a robot of another width; or `with_gyro` is set, and calibration or recording has no gyro.
+        The robot of the calibration has another track width; or `with_gyro` is set, and calibration or recording has no
+        gyro.
     """
     if abs(recording.width_m - calibration.width_m) > 1e-3 * calibration.width_m:
-        why = f"{recording.width_m:g} m, the calibration is of a robot of {calibration.width_m:g} m"
+        why = f"is {recording.width_m:g} m, and {calibration.width_m:g} m in the calibration"
         raise ConfigError("robot.track_width_m", why, "use a calibration of this robot")
     if with_gyro and (calibration.gyro is None or recording.track.gyro is None):
-        raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
+        raise ConfigError("gyro", "is missing in the calibration or in the log", "use the wheels alone")
     turned = calibration.fitted_with_gyro if with_gyro else None
     return calibration.fitted if turned is None else turned
 
 
 SAME_SHARE = 0.98
-"""Share of a log's rows that another log must also have. Then the first log is a part of the other one."""
+"""Share of the samples of a log that a longer log must also have. The log then counts as a part of the longer log."""
 
 SAME_SPEED = 1e-6
 """Largest relative difference of two wheel speeds that count as the same."""
 
 
 def calibrate(runs: Run | Sequence[Run] | Mapping[str, Sequence[Run]], *, allow_unusable: bool = False) -> Calibration:
-    """Return the motion model of a robot from one run or many, tested on data that it was not fitted to.
+    """Return the calibration of a robot from one run or many, tested on data that it was not fitted to.
 
     Parameters
     ----------
-    runs : of `icrtool.fit` or `icrtool.open_run`, of one robot. Of several runs, a run is left out if it is not usable,
-        too short, a copy of another run, or a part of another run. In a mapping from names of grounds to runs, each
-        ground is also left out in turn: a report with the calibration then states the distance on another ground
-    allow_unusable : take runs that are not usable, too
+    runs : runs of one robot, from `icrtool.fit` or `icrtool.open_run`. One of several runs is left out if it is not
+        usable, too short, a copy of another run, or a part of another run. A mapping from names of grounds to runs
+        leaves each ground out in turn, too: a report with the calibration then states the distance on another ground
+    allow_unusable : also take runs that are not usable
 
     Raises
     ------
     ConfigError
-        Runs of different robots or wheel radii, or a track width that is not known.
+        The runs have different track widths or wheel radii, or a track width is not known.
     DataError
-        No run is left, or too short a drive.
+        No run is left, or the runs are too short.
     """
-    # A string is a sequence, too: a path is refused with its own message.
+    # A text is a sequence, too. As a single run, it is refused with a message about paths.
     if isinstance(runs, Mapping):
         grounds = [ground for ground, of_ground in runs.items() for _ in of_ground]
         every = [run for of_ground in runs.values() for run in of_ground]
@@ -360,9 +374,9 @@ def calibrate(runs: Run | Sequence[Run] | Mapping[str, Sequence[Run]], *, allow_
 def calibrate_runs(
     runs: Iterable[Run], *, allow_unusable: bool = False, grounds: Iterable[str] = ()
 ) -> CalibrationResult:
-    """Calibrate as `calibrate` does, and return the held-out table too; only one run at a time is in memory.
+    """Return the calibration of `calibrate` with its held-out table; only one run at a time is in memory.
 
-    `grounds` names the ground of each run, or none.
+    `grounds` has the name of the ground of each run, or is empty.
     """
     ground_of = iter(grounds)
     taken: list[_CalibratedRun] = []
@@ -385,13 +399,14 @@ def calibrate_runs(
     recordings, robots = [log.recording for log in taken], [log.robot for log in taken]
     if not recordings:
         if not left_out:
-            raise ConfigError("runs", "no usable one is given", "name at least one run or log")
+            raise ConfigError("runs", "no run is given", "name at least one run or log")
         if len(left_out) == 1:
-            raise DataError(*left_out[0], "--allow-unusable takes a run that is not usable")
+            raise DataError(*left_out[0], "--allow-unusable also takes a run that is not usable")
         raise DataError("runs", f"none of {len(left_out)} can be used", "; ".join(map(str, left_out)))
     if len(radii_m := {robot.wheel_radius_m for robot in robots}) > 1:
-        why = f"{' and '.join(sorted(map(str, radii_m)))} in the logs given"
-        raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
+        why = f"is {' and '.join(sorted(map(str, radii_m)))} in the given logs"
+        advice = "fit them with the same value, because the parameters refer to it"
+        raise ConfigError("robot.wheel_radius_m", why, advice)
     notes = alone if len(taken) == 1 else tuple(dict.fromkeys(notes for log in taken for notes in log.notes))
     named = [log.ground for log in taken] if all(log.ground for log in taken) else []
     return calibrate_recordings(recordings, robots[0], notes, named)._replace(left_out=tuple(left_out))
@@ -402,9 +417,11 @@ class _CalibratedRun(NamedTuple):
 
     Attributes
     ----------
-    positions : complex (m,), of its fixes, north + i east [m]
+    recording : its recording
+    positions : complex (m,) positions of its fixes, north + i east [m]
+    robot : its robot
     notes : notes for its use together with other runs
-    ground : name of its ground; empty where none was given
+    ground : name of its ground; empty if no ground was given
     """
 
     recording: Recording
@@ -415,10 +432,10 @@ class _CalibratedRun(NamedTuple):
 
 
 def _is_part(log: _CalibratedRun, longer_log: _CalibratedRun) -> bool:
-    """Return whether a log is only a part of a longer log, for example because its recording was cut off.
+    """Return whether a log is a part of a longer log, for example because its recording was cut off.
 
-    The part has the stamps of the longer log. At equal stamps both have equal wheel speeds and positions. Wheel speeds
-    that were computed from wheel positions may differ at the ends of the part.
+    A part has stamps of the longer log, and at equal stamps equal wheel speeds and positions. Wheel speeds that were
+    computed from wheel positions may differ at the ends of the part.
     """
     part, whole = log.recording, longer_log.recording
     stamps, theirs = (
@@ -435,7 +452,7 @@ def _is_part(log: _CalibratedRun, longer_log: _CalibratedRun) -> bool:
 
 
 def _why_left_out(run: Run, candidate: _CalibratedRun, taken: Sequence[_CalibratedRun], *, allow_unusable: bool) -> str:
-    """Return why a run is left out of the calibration; empty where it is taken."""
+    """Return why a run is left out of the calibration; empty if it is taken."""
     if not (run.usable or allow_unusable):
         return f"not usable: {run.document.unusable_because}"
     recording = candidate.recording
@@ -452,7 +469,7 @@ def _why_left_out(run: Run, candidate: _CalibratedRun, taken: Sequence[_Calibrat
 
 
 def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
-    """Return the robot of a run, of track width `width_m`, as a calibration states it."""
+    """Return the robot of a run as a calibration states it, with a track width [m]."""
     robot = run.config.robot
     left, right = (UNSET if error == 1.0 else error for error in run.radius_errors)
     return documents.CalibratedRobot(
@@ -467,7 +484,10 @@ def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
 
 
 def use_notes(run: Run, *, alone: bool = True) -> tuple[Note, ...]:
-    """Return the notes for the user of a calibration from a run; `alone`: the calibration is from no other run."""
+    """Return the notes that a user needs before using a calibration from a run.
+
+    `alone` : the calibration is from this run alone.
+    """
     notes: list[Note] = []
     if alone:
         notes += [] if run.usable else [note("run_not_usable", f"not usable: {run.document.unusable_because}")]

@@ -1,7 +1,7 @@
-"""A calibration: the motion model recommended for a robot, its parameters with covariance, and how it was tested.
+"""A calibration: the recommended motion model of a robot, its parameters with covariance, and its tests.
 
-Frames and signs follow `icrtool`: x forward, y right, turn rate clockwise. Parameters refer to wheel speeds at
-the configured wheel radius.
+Frames and signs follow `icrtool`: x forward, y right, turn rate clockwise. Parameters refer to wheel speeds at the
+configured wheel radius.
 """
 
 from __future__ import annotations
@@ -57,30 +57,31 @@ Frame = Literal["ned", "enu"]
 
 
 class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
-    """Constant parameters of a robot's motion model, their covariance, and the error that they give.
+    """Constant parameters of a robot's motion model, their covariance, and their errors.
 
-    Its fields are the keys of a calibration file.
+    The fields are the keys of a calibration file.
 
     Attributes
     ----------
-    recommended : name of the recommended model; `model`, `terms`, `parameters`, `covariance`: that model
-    models : every model that was fitted, by name
-    gyro : the recommended model with a gyro, None where a log has none
-    logs : the logs that it was fitted to
-    held_out : scores by model, horizon and log, each predicted without that log; of a single log, by block
-    held_out_pooled : scores of all these trials together
-    geometry, geometry_std : ICRs [m], multiplier and radius factors, from one fit
-    controller : numbers for a controller, and their errors where the drive is long enough to measure them
-    error_sources : variances of the effects that the model leaves out, for wheels alone; None where the drive is too
+    recommended : label of the recommended model
+    model, terms, parameters, covariance : name, terms, parameters and covariance of the recommended model
+    models : all models that were fitted, by name
+    gyro : the recommended model with a gyro; None if a log has no gyro
+    logs : the logs that the models were fitted to
+    held_out : errors by model, horizon and log, each predicted without this log; for a single log, by block
+    held_out_pooled : errors of all these trials together
+    geometry, geometry_std : ICRs [m], multiplier and radius factors from one fit, and their standard deviations
+    controller : numbers for a controller, and their errors if the drives are long enough to measure them
+    error_sources : variances of the effects that the model leaves out, for wheels alone; None if the drives are too
         short
-    notes : findings that matter before use; `warnings` : their sentences
+    notes : findings that a user needs before using the calibration; `warnings` : their sentences
     created : date and time, UTC, ISO 8601
-    name : stem of the file that the calibration was read from; the file does not hold this name
+    name : stem of the file that the calibration was read from; the file does not hold it
 
     Raises
     ------
     LookupError, ValueError
-        Its terms or numbers do not form a motion model.
+        The terms or numbers do not form a motion model.
     """
 
     name: str | UnsetType = UNSET
@@ -103,7 +104,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
 
     @property
     def fitted_with_gyro(self) -> FittedModel | None:
-        """The recommended model with a gyro, None where a log has none."""
+        """The recommended model with a gyro; None if a log has no gyro."""
         gyro = self.gyro
         return None if gyro is None else replace(fitted_model(gyro.model, gyro), wheels=self.fitted)
 
@@ -119,17 +120,17 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
 
     @property
     def controller_errors(self) -> documents.ControllerErrors | None:
-        """Errors of the controller's model; None where the drive is too short to measure them."""
+        """Errors of the controller's model; None if the drives are too short to measure them."""
         errors = {name: error for name, error in msgspec.structs.asdict(self.controller).items() if error is not UNSET}
         return msgspec.convert(errors, documents.ControllerErrors) if "pose_variance" in errors else None
 
     def log_names(self) -> str:
-        """Return the names of the logs that it was fitted to, and their number."""
+        """Return the names of the logs, and their number if there are several."""
         names = ", ".join(log.name for log in self.logs)
         return names if len(self.logs) == 1 else f"{len(self.logs)} logs ({names})"
 
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
-        """Return p95 and expected error [m] of all held-out trials of a model together, NaN without trials."""
+        """Return p95 and expected error [m] of a model in all held-out trials of a length; NaN without trials."""
         for score in self.held_out_pooled:
             if score.model == model and score.horizon_m == horizon_m:
                 return score.p95_m, score.expected_m
@@ -146,10 +147,10 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         Raises
         ------
         ValueError
-            Another frame.
+            The frame is neither ``ned`` nor ``enu``.
         """
         if frame not in get_args(Frame):
-            raise ValueError(f"frame {frame!r} is not known: ned or enu")
+            raise ValueError(f"frame {frame!r}: is neither ned nor enu")
         left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
         twist = self.fitted.twist(wheel_motion(left, right, self.width_m))
         if frame == "enu":
@@ -157,23 +158,23 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         return twist[:, 0] if np.ndim(v_left) == 0 else twist
 
     def odometry(self, log: RobotLog) -> Odometry:
-        """Return the path that the wheels of a log make, from the origin with heading zero.
+        """Return the path that the model makes of the wheels of a log, from the origin with heading zero.
 
         Parameters
         ----------
-        log : of `icrtool.read_log`, its sides and senses as sent; its gyro is not used
+        log : result of `icrtool.read_log`; its sides and signs are used as they were sent, its gyro is not used
 
         Raises
         ------
         ConfigError
-            Wheels whose unit needs a radius or resolution that the calibration does not hold and the log does not show.
+            The unit of the wheels needs a radius or resolution, which neither the calibration nor the log has.
         DataError
-            Fewer than two usable wheel samples.
+            The log has fewer than two usable wheel samples.
 
         Notes
         -----
-        A speed holds until the next sample; Euler steps, as in the dropout analysis. Angles and counts become metres
-        with the numbers that the calibration was fitted with.
+        A speed holds until the next sample, and the path consists of Euler steps, as in the dropout analysis. Angles
+        and counts become metres with the numbers that the calibration was fitted with.
         """
         robot = RobotConfig(
             wheel_radius_m=self.robot.wheel_radius_m,
@@ -198,12 +199,11 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
 
         Parameters
         ----------
-        corrected : constants of the sensors that are corrected already in the data that the model observes. NaN: the
-            constant was found in the drive itself, and its usual spread about zero remains. None: all constants are
-            corrected, and begin at zero. Default: no constant is corrected, and the model begins with the constants of
-            the calibration
-        heading_source : as ``heading.source`` of run.json; the calibration's heading offset is used for a heading of
-            this source alone. Default: the source of its logs
+        corrected : corrections of the sensors' constants in the data that the model will observe. A constant that is
+            NaN was found in the drive itself, and has its usual spread about zero. None: all constants are corrected,
+            and begin at zero. Default: no constant is corrected, and the model begins with those of the calibration
+        heading_source : source of the heading in these data, as ``heading.source`` of run.json; the calibration's
+            heading offset is used only for the same source. Default: the source of the calibration's logs
         """
         source = "calibration" if self.name is UNSET else self.name
         prior = prior_of_model(self.width_m, self.fitted, self.fitted_with_gyro, source)
@@ -216,21 +216,21 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         return replace(prior, constants=wheels, turned_constants=turned)
 
     def fitted_to(self, sha256: str) -> bool:
-        """Return whether the calibration was fitted to a log."""
+        """Return whether the calibration was fitted to the log with this SHA-256."""
         return bool(sha256) and any(log.sha256 == sha256 for log in self.logs)
 
     def write(self, path: str | Path) -> Path:
-        """Write the calibration file, whole or not at all; into `path` where `path` is a folder.
+        """Write the calibration file, whole or not at all; if `path` is a folder, write calibration.json into it.
 
         Returns
         -------
         Path
-            The file.
+            The path of the file.
 
         Raises
         ------
         OutputError
-            Something that is not a calibration is there, or it cannot be written.
+            A file that is not a calibration is there, or the file cannot be written.
         """
         from icrtool.output.files.formats import write_calibration
 
@@ -257,7 +257,7 @@ def stored_calibration(document: documents.CalibrationDocument) -> Calibration:
     Raises
     ------
     LookupError, ValueError
-        Its terms or numbers do not form a motion model.
+        The terms or numbers do not form a motion model.
     """
     return Calibration(**msgspec.structs.asdict(document))
 
@@ -266,9 +266,13 @@ def fitted_document(
     fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: documents.CalibratedRobot, *,
     shared_std: float | None = None,
 ) -> RecommendedDocument:  # fmt: skip
-    """Return a model for one robot: parameters with covariance, ICRs, and numbers for a controller.
+    """Return the document of a model for a robot: parameters with covariance, ICRs, and numbers for a controller.
 
-    `shared_std` is passed to `controller_numbers`.
+    Parameters
+    ----------
+    fitted : the model
+    geometry, covariance : ICRs, multiplier and radius factors, and their covariance (6, 6)
+    robot, shared_std : as in `controller_numbers`
     """
     std = np.sqrt(np.diag(covariance)).tolist()
     return RecommendedDocument(
@@ -294,8 +298,10 @@ def controller_numbers(
 
     Parameters
     ----------
-    shared_std : standard deviation of the multiplier between drives where several were pooled; default: the value of
-        other robots
+    geometry, covariance : ICRs, multiplier and radius factors, and their covariance (6, 6)
+    robot : the robot, whose wheel scales multiply the radius factors
+    shared_std : standard deviation of the multiplier between drives, from several drives; default: the value of other
+        robots
     """
     std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     left, right = (1.0 if scale is UNSET else scale for scale in (robot.left_scale, robot.right_scale))
@@ -308,7 +314,7 @@ def controller_numbers(
 
 
 def parameter_documents(fitted: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
-    """Return terms, parameters and covariance of a model."""
+    """Return terms, parameters and covariance of a model as they are stored."""
     rows = zip(fitted.model.terms, fitted.parameters.tolist(), fitted.std.tolist(), strict=True)
     unseen = fitted.not_shown
     documents_by_term = {
@@ -318,7 +324,7 @@ def parameter_documents(fitted: FittedModel) -> tuple[tuple[str, ...], dict[str,
 
 
 LARGEST_PARAMETER = 1e6
-"""Largest size of a parameter, in its unit. A larger value is damage, and its square could overflow."""
+"""Largest size of a parameter, in its unit. A larger value is damaged, and its square could overflow."""
 
 
 def fitted_model(
@@ -329,7 +335,7 @@ def fitted_model(
     Raises
     ------
     LookupError, ValueError
-        Its terms or numbers do not form a motion model.
+        The terms or numbers do not form a motion model.
     """
     model = find_model(name)
     k = len(model.terms)
@@ -347,14 +353,14 @@ def fitted_model(
 
 
 POSE_AFTER_M = CHOICE_HORIZON_M
-"""Distance after which the errors of a calibration are stated to controllers."""
+"""Distance after which the errors of a calibration are stated in exports [m]."""
 
 LARGEST_SHARE = 0.5
 """Largest 95 % error of a calibration, as a share of the distance. Beyond it the calibration is not fit for use."""
 
 
 def unfit_reasons(calibration: Calibration) -> tuple[Note, ...]:
-    """Return why a calibration is not fit for use, from its held-out errors; empty where it is fit."""
+    """Return why a calibration is not fit for use, from its held-out errors; empty if it is fit."""
     reasons = [finding for finding in calibration.notes if is_grave(finding)]
     p95, expected = calibration.held_out_m(RECOMMENDED, POSE_AFTER_M)
     _, without = calibration.held_out_m(NO_SLIP, POSE_AFTER_M)
@@ -374,7 +380,8 @@ def export_notes(calibration: Calibration, model: str = RECOMMENDED) -> tuple[No
 
     Parameters
     ----------
-    model : whose terms are used: a controller has no parameter for the last three of `RECOMMENDED`
+    model : name of the model whose terms are used; a controller has no parameters for the last three terms of
+        `RECOMMENDED`
     """
     reasons = [reason for reason in unfit_reasons(calibration) if reason not in calibration.notes]
     for name in (name for name in calibration.fitted.not_shown if name in MODELS[model].terms):
@@ -387,7 +394,7 @@ def export_notes(calibration: Calibration, model: str = RECOMMENDED) -> tuple[No
 
 
 def factor_to_old(calibration: Calibration) -> float | None:
-    """Return the ratio of the multiplier to the multiplier of the log's odometry; None where the latter is unknown."""
+    """Return the ratio of the multiplier to the multiplier of the log's odometry; None if the latter is not known."""
     old_width_m = calibration.robot.twist_width_m
     if old_width_m is UNSET:
         return None

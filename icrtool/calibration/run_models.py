@@ -1,8 +1,7 @@
-"""The motion models of one run: fitted (for `icrtool.fit`), and each tested on distance it was not fitted to.
+"""The motion models of one run: fitted for `icrtool.fit`, and tested on distance that they were not fitted to.
 
-Each model is fitted to windows that share no distance with its test trials (`icrtool.calibration.held_out`). The
-filter's momentary and final ICRs are compared with these models. Rows with a gyro combine the turn rates of gyro and
-wheels.
+Each model is fitted to windows that share no distance with its trials (`icrtool.calibration.held_out`). The filter's
+momentary and final ICRs are compared with these models. Rows with a gyro combine the turn rates of gyro and wheels.
 """
 
 from __future__ import annotations
@@ -36,12 +35,12 @@ from icrtool.records.run_document import GeometryDocument, RunDocument
 
 
 def with_motion(run: Run) -> RunDocument:
-    """Return the document of a run with its motion model, ICRs and controller numbers.
+    """Return the document of a run with its motion model, ICRs and numbers for a controller.
 
     Notes
     -----
-    ICRs and controller numbers come from one fit of `FIVE` to the windows of the drive, so that
-    (right - left) / b is the multiplier. With preset ``paper`` they are the filter's estimates at the end.
+    ICRs and numbers come from one fit of `FIVE` to the windows of the drive, so that (right - left) / b is the
+    multiplier. With preset ``paper`` they are the filter's estimates at the end.
     """
     recording = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     try:
@@ -50,7 +49,7 @@ def with_motion(run: Run) -> RunDocument:
         fits = {}
     of_filter, width = run.config.filter.rules.final_of_filter, recording.width_m
     if of_filter:
-        # The filter's final ICRs, with radii as configured.
+        # The ICRs are the filter's final ICRs, and the radii are the configured radii.
         right, left, x = run.table.icrs_at(-1)
         geometry = TrackGeometry(right, left, x, (right - left) / width, 1.0, 1.0)
         by_icr = np.zeros((len(geometry), ICR_VALUES))
@@ -60,13 +59,13 @@ def with_motion(run: Run) -> RunDocument:
     elif FIVE in fits:
         geometry, covariance = fits[FIVE].geometry(width)
     else:
-        short = "the drive is too short for a motion model: the filter's ICRs alone are known"
+        short = "the drive is too short for a motion model: only the filter's ICRs are known"
         return msgspec.structs.replace(run.document, partly_because=short if run.usable else None)
     robot = pooled.robot_of(run, width)
     recommended = None
     if run.usable and run.track_width_m is not None and RECOMMENDED in fits:
         recommended = fitted_document(fits[RECOMMENDED], geometry, covariance, robot)
-    # An ICR is shown by the excitation of the drive, and by its own standard deviation.
+    # An ICR counts as shown if the drive could show it, and if its own standard deviation is small.
     verdicts = run.document.excitation.verdict
     largest = WEAK_SHARE * abs(geometry.y_icr_right_m - geometry.y_icr_left_m)
     shown: dict[str, float] = {}
@@ -80,7 +79,7 @@ def with_motion(run: Run) -> RunDocument:
     )
     if recommended is None:
         return _with_verdict(document)
-    # The common error of both y ICRs cancels in the multiplier, so its own standard deviation decides.
+    # A common error of both y ICRs cancels in the multiplier, so the standard deviation of the multiplier decides.
     numbers = controller_numbers(geometry, covariance, robot)
     if of_filter or numbers.multiplier_std <= WEAK_SHARE * abs(numbers.multiplier):
         document = msgspec.structs.replace(document, controller=numbers)
@@ -88,13 +87,13 @@ def with_motion(run: Run) -> RunDocument:
 
 
 def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocument:
-    """Return the document of a run, which states what the drive does not show.
+    """Return the document of a run with the numbers that the drive does not show.
 
     A run that shows neither a y ICR nor the multiplier is not usable.
 
     Parameters
     ----------
-    multiplier_std : standard deviation of a multiplier that is not shown, as text
+    multiplier_std : text with the standard deviation of a multiplier that is not shown
     """
     if not document.usable:
         return document
@@ -118,7 +117,13 @@ def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocumen
 
 
 class Model(NamedTuple):
-    """ICRs that predict motion from wheel speeds: three per start, or three for all; `knows` as in `ComparedRow`."""
+    """ICRs that predict motion from wheel speeds.
+
+    Attributes
+    ----------
+    icrs : one triple for each start, or one for all starts
+    knows : as in `ComparedRow`
+    """
 
     name: str
     icrs: FrozenIcrs
@@ -126,13 +131,13 @@ class Model(NamedTuple):
 
 
 class ComparedRow(NamedTuple):
-    """A row whose numbers do not come from the filter.
+    """A row of a report whose numbers do not come from the filter.
 
     Attributes
     ----------
-    errors_of : its errors in trials, NaN where it has none; path : its path from one state to another, None where it
-        has none
-    knows : the data that its numbers were learned from; empty where `icrtool.records.rows` states it
+    errors_of : returns the errors of the row in trials; NaN for a trial that it cannot predict
+    path : returns the path of the row between two states; None if it cannot predict the path
+    knows : words for the data that its numbers were learned from; empty if `icrtool.records.rows` states them
     """
 
     name: str
@@ -149,11 +154,13 @@ def adaptive_rows(
     *,
     refit_sensors: bool = False,
 ) -> list[ComparedRow]:
-    """Return row ``adaptive`` of a recording, and the row with the measured heading of kind `heading` if there is one.
+    """Return row ``adaptive`` of a recording, and the same row with a measured heading if there is one.
 
     Parameters
     ----------
-    past, refit_sensors : as in `icrtool.calibration.adaptive_rows.adapt` and `prior_for`
+    heading : kind of the measured heading in the recording; empty without one
+    calibrations, refit_sensors : as in `icrtool.calibration.adaptive_rows.prior_for`
+    past : as in `icrtool.calibration.adaptive_rows.adapt`
     """
     prior = prior_for(recording, calibrations, refit_sensors=refit_sensors)
     drive = adapt(recording, prior, past)
@@ -170,11 +177,12 @@ class ComparedModels(NamedTuple):
 
     Attributes
     ----------
-    table : held-out table of the run's recording: its trials, blocks of distance, and fits
-    track : the run's drive
+    rows : the rows
+    table : held-out table of the run's recording
+    track : track of the run's recording
     heading : kind of the measured heading that rows use, ``gyro`` or ``heading``; empty without one
     notes : findings about rows that were left out, and about corrections
-    calibration : the result of ``icrtool calibrate`` for this run alone; None where the track width is not known
+    calibration : the calibration from this run alone; None if the track width is not known
     """
 
     rows: tuple[ComparedRow, ...]
@@ -193,32 +201,32 @@ def compare_models(
     *,
     refit_sensors: bool = False,
 ) -> ComparedModels:
-    """Return every model with its test on distance that it was not fitted to.
+    """Return the rows of all models of a run, tested on distance that they were not fitted to.
 
     Parameters
     ----------
-    run : a finished run, or one read back
-    headings : measured headings, best first, for the models with a measured turn rate
-    calibrations : row ``adaptive`` begins with the first one that was not fitted to this log; without one, with what is
-        known of other robots
-    past : the run with the poses that were known when it was driven; default: its own, of the filter
+    run : the run
+    headings : measured headings of the run, the best first; the first one that turns with the robot is used
+    calibrations : row ``adaptive`` begins with the first calibration that was not fitted to this log, else with the
+        prior of other robots
+    past : the run with the poses that were known when it was driven; default: its own poses
     refit_sensors : row ``adaptive`` begins without the constants of the calibration's sensors
 
     Raises
     ------
     DataError
-        The drive is too short to hold anything out.
+        The drive is too short for a held-out test.
 
     Notes
     -----
-    Cross-validation (Stone 1974; see `icrtool.calibration.held_out` for what is left out of a trial's fit). The
-    filter's momentary ICRs were learned before the start of a trial, its final ICRs from the whole drive.
+    Cross-validation (Stone 1974); `icrtool.calibration.held_out` states the data that the fit for a trial leaves out.
+    The filter's momentary ICRs were learned before the start of a trial, its final ICRs from the whole drive.
     """
     recording, heading, notes = _with_heading(run, headings)
     parts = {"ahead of": recording.lever.ahead, "to the right of": recording.lever.aside}
     if unknown := " and ".join(word for word, known in parts.items() if not known):
-        unknown_place = f"how far {unknown} the body's origin the position is measured is not known"
-        lever = "in row controller it is a constant of this log"
+        unknown_place = f"the distance of the position sensor {unknown} the body's origin is not known"
+        lever = "row controller uses the distance that this log shows"
         why = f"{unknown_place}: {lever}; frames.antenna_forward_m and antenna_right_m set it"
         notes.append(note("lever_unknown", why))
     held_out = hold_out([recording])
@@ -235,35 +243,42 @@ def compare_models(
 
 
 def with_poses_of(recording: Recording, run: Run) -> Recording:
-    """Return a recording with the poses of a run of the same states."""
+    """Return a recording with the poses of a run that has the same states."""
     table = run.table
     track = recording.track._replace(north=table.north_m, east=table.east_m, heading=table.heading_rad)
     return replace(recording, track=track)
 
 
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, list[Note]]:
-    """Return the recording with the first measured heading that turns with the robot, its kind, and notes."""
+    """Return the recording with the first measured heading that turns with the robot, its kind, and notes.
+
+    The kind is empty if no heading turns with the robot.
+    """
     notes = list[Note]()
     plain = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     for measured in headings:
         with_rate = pooled.with_turn_rate(plain, measured, run.config.frames.gyro_delay_s)
         if with_rate.track.gyro is not None:
             if with_rate.gyro_reversed:
-                why = f"the {measured.kind} counts turns in the other direction: its sign was changed"
+                why = f"the {measured.kind} counts turns in the other direction; its sign was changed"
                 notes.append(note("gyro_sign_changed", why))
             return with_rate, measured.kind, notes
-        why = f"the {measured.kind} does not turn with the robot: rows with it are left out"
+        why = f"the {measured.kind} does not turn with the robot; rows with it are left out"
         notes.append(note("gyro_not_used", why))
     if not notes:
-        why = "the run holds no heading measured apart from the position: no rows with one"
+        why = "the run has no heading that is measured apart from the position; rows with one are left out"
         notes.append(note("gyro_not_used", why))
     return plain, "", notes
 
 
 def _rows(run: Run, held_out: HeldOut, kind: str, past: Recording) -> Iterator[ComparedRow]:
-    """Yield the held-out rows; the rows of the filter's ICRs with a measured heading come last.
+    """Yield the held-out rows, then the rows of the filter's ICRs with a measured heading.
 
-    `past` is the recording with the poses that were known when it was driven.
+    Parameters
+    ----------
+    held_out : held-out table of the run
+    kind : kind of the measured heading
+    past : the recording with the poses that were known when it was driven
     """
     for name in held_out.rows:
         if name == NO_SLIP:
@@ -273,7 +288,7 @@ def _rows(run: Run, held_out: HeldOut, kind: str, past: Recording) -> Iterator[C
     if held_out.has_gyro:
         (recording,) = held_out.recordings
         for model in models_of(run):
-            # Rows for comparison have the middle of the ICRs at the origin: with a measured turn each is no_slip_gyro.
+            # With a measured turn rate, rows for comparison would be equal: their ICRs have the middle at the origin.
             if not row_of(model.name).compared:
                 of_past = model.name == "icr"
                 lines = partial(past_gyro_lines, past.track) if of_past else partial(pooled.gyro_line, recording)
@@ -282,7 +297,7 @@ def _rows(run: Run, held_out: HeldOut, kind: str, past: Recording) -> Iterator[C
 
 
 def models_of(run: Run) -> tuple[Model, ...]:
-    """Return the filter's ICRs at each start, its final ICRs, and the ICRs of track width and published skid factor."""
+    """Return the models with the filter's momentary and final ICRs, without slip, and with the published factor."""
     driven = odometry_icrs(run.table, run.track_width_m)
     models = [Model("icr", driven["icr_momentary"], momentary_knows(run))]
     if "no_slip" in driven:
@@ -293,7 +308,7 @@ def models_of(run: Run) -> tuple[Model, ...]:
 
 
 def momentary_knows(run: Run) -> str:
-    """Return in words the data that the momentary ICRs of a run were learned from."""
+    """Return the data that the momentary ICRs of a run were learned from, in words."""
     start, parts = run.began_with, [PAST]
     if start is not None:
         parts = [f"started from {start.source or 'another run'}", PAST]
@@ -305,11 +320,12 @@ def momentary_knows(run: Run) -> str:
 
 
 def turned_path(run: Run, recording: Recording, turned: Floats, rows: slice) -> tuple[Floats, Complexes]:
-    """Return heading [rad] and place, ahead + j right [m], at some states (k,), by mean track speed and a heading.
+    """Return heading [rad] and place, forward + j right [m], of a path by mean track speed and a heading.
 
     Parameters
     ----------
-    turned : (k,) the heading there [rad]
+    turned : (k,) heading at the states of `rows` [rad]
+    rows : states of the path; the place at the first one is 0
     """
     lo, hi = rows.start, rows.stop - 1
     place = np.zeros(hi + 1 - lo, np.complex128)
@@ -326,16 +342,17 @@ def turned_path(run: Run, recording: Recording, turned: Floats, rows: slice) -> 
 def _errors_turned(
     run: Run, recording: Recording, icrs: FrozenIcrs, lines: Callable[[], PastLines], trials: Trials
 ) -> TrialErrors:
-    """Return the errors (k, h) of ICRs (n,) or (1,) along the path of `turned_path`.
+    """Return the errors (k, h) of ICRs in trials in which a gyro gives the turn rate.
 
     Parameters
     ----------
-    lines : scales and biases of the gyro; each pair holds from one state on
+    icrs : ICRs (n,) of each start, or (1,) of all starts
+    lines : returns scales and biases of the gyro; each pair holds from one state on
 
     Notes
     -----
     If omega is measured, the displacement has two terms: the sum of V e^{j psi} dt, with the mean track speed V, and
-    ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j. It does not depend on W = y_r - y_l.
+    ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j. The displacement does not depend on W = y_r - y_l.
     """
     track, (first_rows, scales, biases) = recording.track, lines()
     gyro = track.gyro if track.gyro is not None else np.zeros(len(track.t))

@@ -1,8 +1,9 @@
-"""Findings of one log's alignment about its sensors: verdict, reason and setting of each.
+"""Findings of the alignment of one log about its sensors: verdict, reason and proposed setting of each.
 
 The numbers are taken from the run (``alignment`` in run.json), so that `fit` and `calibrate` cannot disagree. Positions
-show only antenna forward - x ICR and antenna right - middle of the ICRs: an antenna further ahead has the same effect
-as ICRs further back. To separate the two, one of them must be known.
+show only the differences antenna forward - x ICR and antenna right - middle of the ICRs, because an antenna further
+ahead has the same effect as ICRs further back. If the position of the antenna or of the ICRs is known, the other
+follows.
 """
 
 from __future__ import annotations
@@ -25,7 +26,14 @@ from icrtool.records.run import Run
 
 
 class _Kind(NamedTuple):
-    """A parameter: words for it, a useful standard deviation, and its name in run.json where that is not its key."""
+    """A parameter of a sensor.
+
+    Attributes
+    ----------
+    label : words for the parameter
+    useful : largest standard deviation with which the estimate is useful, in its unit
+    finding : name of the parameter in run.json; empty if it is the key
+    """
 
     label: str
     useful: float
@@ -50,13 +58,13 @@ FINDING_KINDS = {
     "right_scale": _Kind("right wheel scale", 0.01),
     SEPARATION: _Kind("ICR separation y right − y left", 0.05),
 }
-"""Words, useful standard deviation and name of each parameter, by its key in files."""
+"""Every parameter by its key in calibration files."""
 
 WEAK = 3.0
-"""Largest ratio of a standard deviation to the useful one that counts as weak. Above it the parameter is not shown."""
+"""Ratio of a standard deviation to the useful one above which a parameter is not shown. From 1 on it is weak."""
 
 SHOWN_STRAIGHT = ("left_scale", "right_scale", "gnss_delay_s", "heading_offset_deg")
-"""Parameters that a straight drive shows."""
+"""Keys of the parameters that a straight drive shows."""
 
 DELAYS = ("gnss_delay_s", "heading_delay_s", "gnss_delay_against_heading_s")
 """Keys of the delays."""
@@ -78,15 +86,15 @@ LABELS = {key: kind.label for key, kind in FINDING_KINDS.items()} | {
     "antenna_forward_m": "antenna forward", "antenna_right_m": "antenna right", "y_icr_right_m": "y ICR right",
     "y_icr_left_m": "y ICR left", "x_icr_m": "x ICR",
 }  # fmt: skip
-"""Words for each parameter, by its key in files."""
+"""Words for each parameter by its key in calibration files."""
 
 
 def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.SensorDocument:
-    """Return the findings of a run's alignment with their verdicts, and the settings to configure.
+    """Return the findings of a run's alignment with their verdicts, and the proposed settings.
 
     Parameters
     ----------
-    x_icr_m : known forward position of the ICRs; resolves the antenna's position
+    x_icr_m : forward position of the ICRs [m], if it is known; the position of the antenna follows from it
 
     Raises
     ------
@@ -96,7 +104,7 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.Sensor
     wheels, findings = run.document.wheels, run.document.alignment
     if not {kind.finding or key for key, kind in FINDING_KINDS.items()} <= findings.keys():
         metres = run.document.drive.distance_m
-        why = f"{metres:.0f} m of driven distance are too few windows"
+        why = f"{metres:.0f} m of driven distance give too few windows"
         raise DataError(run.name, why, "drive longer")
     driven, parameters = _drive(run), {}
     for key, kind in FINDING_KINDS.items():
@@ -124,6 +132,7 @@ def with_sensors(calibration: Calibration, sensors: documents.SensorDocument) ->
 
 
 def _drive(run: Run) -> documents.SensorDrive:
+    """Return distance, turns, usual turn rate and speed of a drive."""
     table, excitation = run.table, run.document.excitation
     left, right = (
         speed / scale for speed, scale in zip((table.v_left_mps, table.v_right_mps), run.wheel_scales, strict=True)
@@ -143,32 +152,39 @@ def _drive(run: Run) -> documents.SensorDrive:
 
 
 def _numbers(finding: Finding | documents.SensorParameter) -> tuple[float, float]:
-    """Return an estimate and its standard deviation, NaN where the drive does not show it."""
+    """Return an estimate and its standard deviation; NaN if the drive does not show them."""
     return math.nan if finding.value is None else finding.value, math.nan if finding.std is None else finding.std
 
 
 def _parameter(value: float, std: float, verdict: documents.SensorVerdict, note: str = "") -> documents.SensorParameter:
+    """Return a parameter; a number that is not finite becomes None."""
     return documents.SensorParameter(finite_or_none(value), finite_or_none(std), verdict, note)
 
 
 def _reason(key: str, driven: documents.SensorDrive) -> str:
-    """Return why the drive does not determine a parameter well, and what to drive."""
+    """Return why the drive does not show a parameter well, and what to drive."""
     mean, std = driven.speed_mean_mps, driven.speed_std_mps
     if key.startswith("gnss_delay") and std < STEADY * mean:
-        return f"speed hardly changes ({mean:.2f} ± {std:.2f} m/s): add stops and starts"
+        return f"the speed hardly changes ({mean:.2f} ± {std:.2f} m/s): add stops and starts"
     right, left = math.radians(driven.turned_right_deg), math.radians(driven.turned_left_deg)
     lacks = lacking_turns(right, left)
     if lacks and (key not in SHOWN_STRAIGHT or right + left >= TURNS_NEEDED_RAD):
         return lacks
     if key in DELAYS:
         return RESPONSE_PART
-    return f"too short a drive for this noise: {driven.distance_m:.0f} m"
+    return f"the drive of {driven.distance_m:.0f} m is too short for this noise"
 
 
 def _derive(
     run: Run, direct: Mapping[str, documents.SensorParameter], x_icr_m: float | None
 ) -> dict[str, documents.SensorParameter]:
-    """Return the positions of antenna and ICRs, from the known one of both; by default the ICRs' middle is y = 0."""
+    """Return the positions of antenna and ICRs; the ICRs' middle is y = 0 unless the antenna's position is known.
+
+    Parameters
+    ----------
+    direct : the parameters that positions show directly
+    x_icr_m : known forward position of the ICRs [m]; None: not known
+    """
     of_antenna_and_icrs = [direct[key] for key in (ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION)]
     (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, of_antenna_and_icrs)
     of_ahead, of_aside, of_separation = (parameter.verdict for parameter in of_antenna_and_icrs)
@@ -181,7 +197,7 @@ def _derive(
         antenna_forward = _parameter(ahead + x_icr_m, ahead_std, of_ahead, note)
         x = _parameter(x_icr_m, 0.0, "given")
     else:
-        fix = "position determines only antenna forward − x ICR: give frames.antenna_forward_m, or --x-icr"
+        fix = "positions show only antenna forward − x ICR: give frames.antenna_forward_m, or --x-icr"
         antenna_forward = x = _parameter(math.nan, math.nan, "not separable", fix)
     if right is not None:
         antenna_right = _parameter(right, 0.0, "given")
@@ -189,7 +205,7 @@ def _derive(
         stds = [_numbers(run.document.alignment[name])[1] for name in ("y_icr_right_m", "y_icr_left_m")]
         verdict = max((of_separation, of_aside), key=("given", "shown", "weak", "not shown").index)
     else:
-        middle, note = 0.0, "if the ICRs lie symmetrically about the middle of the body"
+        middle, note = 0.0, "if the ICRs are symmetric about the middle of the body"
         antenna_right = _parameter(aside, aside_std, of_aside, note)
         stds, verdict = [separation_std / 2] * 2, of_separation
     half = separation / 2
@@ -203,11 +219,11 @@ def _derive(
 
 
 def _settings(parameters: Mapping[str, documents.SensorParameter], run: Run) -> dict[str, float]:
-    """Return the settings of parameters that are known well enough, and are large enough, to be configured."""
+    """Return the proposed settings: of parameters that are shown, and that differ from their neutral value."""
     wheels = run.config.wheels
     left, right = (1.0 if given == "auto" else given for given in (wheels.left_scale, wheels.right_scale))
-    # Columns: setting, parameter, neutral value, smallest difference from it, present value that the estimate
-    # multiplies.
+    # The columns are: setting, parameter, neutral value, smallest difference from it, and the present value, which the
+    # estimate multiplies.
     rows = (
         ("frames.heading_offset_deg", "heading_offset_deg", 0.0, 0.3, 1.0),
         ("frames.reference_delay_s", "gnss_delay_s", 0.0, RESPONSE_S, 1.0),
@@ -221,7 +237,7 @@ def _settings(parameters: Mapping[str, documents.SensorParameter], run: Run) -> 
     for key, name, neutral, least, times in rows:
         value, std = _numbers(parameters[name])
         large = abs(value - neutral) > max(SETTING_SIGMAS * std, least)
-        # a stream that seems to lead: the robot's motion lags its wheels
+        # If a stream seems to lead, the robot's motion lags its wheels, and no setting is proposed.
         leads = name in DELAYS and value <= 0.0
         if parameters[name].verdict == "shown" and large and not leads:
             settings[key] = round(times * value, 4)

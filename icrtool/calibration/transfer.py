@@ -1,8 +1,8 @@
 """Comparison of groups of runs: parameters, differences, and errors of the calibration of one group in another.
 
-An element of the transfer matrix holds the errors of the row's calibration in the trials of the column's runs. On the
-diagonal both are the same group. There each trial is predicted by a fit without its log or, in a group of a single run,
-by a fit to the rest of the drive.
+The transfer matrix has a row for the calibration of each group, and a column for the runs of each group. On its
+diagonal, the calibration and the runs are of the same group. There, each trial is predicted by a fit without its log
+or, in a group of a single run, by a fit to the rest of the drive.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ TRANSFER_HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
 """Distances of the errors of a comparison [m]."""
 
 TWO_SIDED = 1.96
-"""Standard deviations in a 95 % interval."""
+"""Half the length of a 95 % interval of a normal value, in standard deviations."""
 
 SAME_ROUTE_M = 1.0
-"""Largest distance between two drives on the same route, at equal driven distance [m]."""
+"""Largest distance between two drives of the same route at equal driven distances [m]."""
 
 COMPARED = ("y_icr_right_m", "y_icr_left_m", "x_icr_m", "multiplier", "radius_left", "radius_right")
 """Fields of `TrackGeometry` that are compared."""
@@ -49,15 +49,15 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> documents.GroupCompar
 
     Parameters
     ----------
-    groups : at least two, by name, each the runs of one robot; groups of different robots have no errors of one
-        calibration on the other (NaN)
+    groups : runs of one robot, by the name of the group; at least two groups. If two groups have different robots, the
+        calibration of one has no errors in the other (NaN)
 
     Raises
     ------
     ConfigError
-        Fewer than two groups, a log that is in two of them, or robots that differ in one group.
+        There are fewer than two groups, a log is in two groups, or a group has different robots.
     DataError
-        Too short a drive.
+        The runs of a group are too short.
 
     Notes
     -----
@@ -67,7 +67,7 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> documents.GroupCompar
     differences come from pairs of blocks.
     """
     if len(groups) < 2:
-        raise ConfigError("groups", "only one is given", "name two or more to compare")
+        raise ConfigError("groups", "only one group is given", "name two or more to compare")
     results = {name: calibrate_runs(runs) for name, runs in groups.items()}
     recordings = {name: result.table.recordings for name, result in results.items()}
     seen: dict[str, str] = {}
@@ -129,7 +129,7 @@ def compare_calibrations(
 def _verdict(
     first: str, second: str, parameters: Sequence[documents.ParameterDifference], cost: documents.TransferCost
 ) -> str:
-    """Return one sentence: how the multiplier differs, and what the first calibration adds to the second's errors."""
+    """Return how the multipliers of two groups differ, and what the first calibration adds to the second's errors."""
     multiplier = next(difference for difference in parameters if difference.quantity == "multiplier")
     change = with_std(multiplier.difference, multiplier.std)
     differs = (
@@ -145,21 +145,24 @@ def _verdict(
 
 
 class _Tested(NamedTuple):
-    """Errors (k, h) [m] of trials, and path lengths (k,) [m] at their starts; recordings in sequence."""
+    """Errors (k, h) [m] of the trials of all recordings in sequence, and path lengths (k,) [m] at their starts."""
 
     errors: Floats
     path: Floats
 
 
 def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bool) -> _Tested:
-    """Return the errors of a calibration in recordings; `own`: each trial is predicted by a fit without it."""
+    """Return the errors of a calibration in recordings.
+
+    `own` : the calibration is from these recordings, so each trial is predicted by a fit without it.
+    """
     errors, path, before = [], [], 0.0
     for i, recording in enumerate(recordings):
         trials = cut_trials(recording, TRANSFER_HORIZONS_M)
-        intervals = (
+        errors_of_trials = (
             result.table.errors(RECOMMENDED, i, trials) if own else predictor(result.calibration, recording)(trials)
         )
-        errors.append(intervals.position)
+        errors.append(errors_of_trials.position)
         path.append(before + recording.track.distance[trials.starts])
         before = path[-1][-1]
     return _Tested(np.concatenate(errors), np.concatenate(path))
@@ -179,7 +182,10 @@ def _sum_up(
 
 
 def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[documents.ErrorsAt]:
-    """Return the difference of errors at each horizon, second minus first; `paired`: over trials that both have."""
+    """Return the difference of p95 and mean at each horizon, second minus first, with 95 % intervals.
+
+    `paired` : both have the same trials or the same route, so that their blocks of path are compared in pairs.
+    """
     differences = []
     same = np.array_equal(first.path, second.path)
     for h, horizon in enumerate(TRANSFER_HORIZONS_M):
@@ -201,7 +207,7 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[docum
 
 
 def same_route(first: Track, second: Track) -> bool:
-    """Return whether two drives took the same route at the same distance."""
+    """Return whether two drives took the same route: at equal distances they are less than `SAME_ROUTE_M` apart."""
     ends = [float(track.distance[-1]) for track in (first, second)]
     if abs(ends[1] - ends[0]) > 0.05 * min(ends):
         return False
@@ -212,6 +218,7 @@ def same_route(first: Track, second: Track) -> bool:
 
 
 def _parameter_differences(first: Calibration, second: Calibration) -> tuple[documents.ParameterDifference, ...]:
+    """Return the difference of each compared parameter, second minus first, with its standard deviation."""
     differences = []
     for name in COMPARED:
         before, after = first.geometry[name], second.geometry[name]

@@ -70,9 +70,9 @@ def dropout(
     run : of `icrtool.fit` or `icrtool.open_run`
     horizons_m : distances without GNSS, in any order; default: from the run's configuration
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
-    models : models that predict; default `models_of` of the run
+    models : models that predict; default: `models_of` of the run
     seed : seed of the random draws of the reference's own error
-    sink : receives every single error (for ``--trials``)
+    sink : receives every error (for ``--trials``)
 
     Returns
     -------
@@ -86,16 +86,16 @@ def dropout(
     ConfigError
         A horizon is not a positive number.
     ValueError
-        Two models of one name.
+        Two models have the same name.
 
     Notes
     -----
     A trial starts at a recorded state and keeps its ICRs; wheel speeds alone predict the path. The error is the
-    horizontal distance to the filter's estimate at the first state that is the horizon further along the path. A
-    start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
-    where it ends in a real GNSS outage. Only the last state of a standstill starts trials: the other states would
-    repeat the same trial, and a parked robot would decide the result. Overlapping trials are not independent. Therefore
-    the intervals come from blocks of path of at least four horizons (`icrtool.kernels.error_statistics`).
+    horizontal distance to the filter's estimate at the first state that is one horizon further along the path. A start
+    gives no trial if less path is left, if the path crosses a gap in the wheel data, or if it ends in a GNSS outage of
+    the log. Only the last state of a standstill starts trials, because the other states would repeat the same trial,
+    and a parked robot would decide the result. Overlapping trials are not independent, so the intervals come from
+    blocks of path of at least four horizons (`icrtool.kernels.error_statistics`).
     """
     check_type(run, Run, MAKE_RUN)
     request = ReportRequest(
@@ -130,31 +130,31 @@ def dropout_report(
     baseline: report.BaselineReport | None = None,
     sink: ErrorSink | None = None,
 ) -> report.DropoutReport:
-    """Return how far a robot can drive without GNSS, as complete as ``icrtool dropout-report``.
+    """Return the complete dropout report of a run, with all results of ``icrtool dropout-report``.
 
     Parameters
     ----------
-    run : of `icrtool.fit` or `icrtool.open_run`
+    run : result of `icrtool.fit` or `icrtool.open_run`
     horizons_m, budgets_m : distances without GNSS [m]; largest allowed errors [m], for which the distance is reported
     gates, strict_gates, allow_unusable : acceptance limits, and how they are checked
     outage_s, outage_at_s : lengths and start times of forced outages [s]
     starts, reference : states that trials start from; estimates that trials are compared with
     without_events, with_jumps : leave out trials across slip events; count trials across jumps of the reference
-    refit_sensors : heading offset, delays and gyro bias are refitted in this log for `calibrations`
-    ladder, seed : whether models are tested on held-out distance; seed of the random draws
+    refit_sensors : refit heading offset, delays and gyro bias of `calibrations` in this log
+    ladder, seed : test models on held-out distance; seed of the random draws
     score : topics of poses in the log; each becomes a row ``topic:NAME``
-    log : the log of the run, in a form that `icrtool.read_log` takes; scored topics are read from it
-    calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`. Each becomes a row ``calibration``; if there
-        are several, ``calibration:STEM`` with the stem of its file. If calibration and log both have a gyro, there is
+    log : the log of the run, as `icrtool.read_log` takes it; scored topics are read from it
+    calibrations : results of `icrtool.calibrate` or `icrtool.open_calibration`. Each becomes a row ``calibration``; one
+        of several becomes ``calibration:STEM`` with the stem of its file. If calibration and log have a gyro, there is
         also a row with the suffix ``_gyro``. Row ``adaptive`` begins with the first calibration that was not fitted to
-        this log, or without such a calibration with what is known of other robots
+        this log, else with the prior of other robots
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
-    sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
+    sink : receives every error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
     Raises
     ------
     ConfigError
-        A limit, horizon, budget, outage or scored topic that cannot be used, or a calibration of another robot.
+        A limit, horizon, budget, outage or scored topic cannot be used, or a calibration is of another robot.
     DataError
         The run has fewer than two states.
     LogError
@@ -164,7 +164,7 @@ def dropout_report(
 
     Notes
     -----
-    The fields of `icrtool.records.requests.ReportRequest` have the same names and state what each means.
+    `icrtool.records.requests.ReportRequest` has fields of the same names, and states the meaning of each.
     """
     request = ReportRequest(
         horizons_m=None if horizons_m is None else tuple(horizons_m),
@@ -198,8 +198,8 @@ def report_on(
 ) -> report.DropoutReport:
     """Return the dropout report of a request.
 
-    `dropout_report` makes the request of its keyword arguments; the other parameters and the errors are the same.
-    `watch` is called with the name of each stage when it begins.
+    `dropout_report` describes the other parameters and the errors. `watch` is called with the name of each stage when
+    it begins.
     """
     check_type(run, Run, MAKE_RUN)
     watch("outages and examples")
@@ -262,13 +262,13 @@ def report_on(
 
 
 class _Runs(NamedTuple):
-    """The run of a report in three forms, which are the same where the request changes nothing.
+    """The run of a report in three forms. A form is the run itself if the request does not change it.
 
     Attributes
     ----------
-    with_events : trials may cross slip events
-    filtered : with the filter's poses; each slip event is a gap where the request leaves slip events out
-    compared : with the poses that trials are compared with
+    with_events : the run whose trials may cross slip events
+    filtered : the run with the filter's poses; slip events are gaps if the request leaves them out
+    compared : the run with the poses that trials are compared with
     """
 
     with_events: Run
@@ -277,7 +277,7 @@ class _Runs(NamedTuple):
 
     @classmethod
     def of(cls, run: Run, request: ReportRequest) -> _Runs:
-        """Return the forms of a run.
+        """Return the forms of a run for a request.
 
         Raises
         ------
@@ -295,12 +295,12 @@ def _outage_plans(run: Run, request: ReportRequest) -> list[tuple[tuple[int, int
     """Return the begins and ends [ns] of the forced outages of each length."""
     lengths_s = forced_lengths_s(run, request)
     if request.outage_at_s and not lengths_s:
-        raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
+        raise ConfigError("outage_at_s", "gives begins of outages without a length", "give outage_s too")
     return [shown_paths.plan_outages(run, length, request.outage_at_s) for length in lengths_s]
 
 
 def _horizons_of(run: Run, request: ReportRequest, limits: Iterable[Gate]) -> list[float]:
-    """Return the requested horizons [m], else the configured ones, and the horizons of acceptance limits."""
+    """Return the requested or else configured horizons [m], and the horizons of acceptance limits."""
     horizons_m = list(request.horizons_m if request.horizons_m is not None else run.config.dropout.horizons_m)
     for at_m in (gate.horizon_m for gate in limits):
         if at_m is not None and not any(math.isclose(at_m, horizon, rel_tol=1e-9) for horizon in horizons_m):
@@ -313,11 +313,11 @@ class _TestedRows(NamedTuple):
 
     Attributes
     ----------
-    of_calibrations, of_topics : their rows
+    of_calibrations, of_topics : rows of the calibrations, and of the scored topics
     calibrations : the record of each used calibration
-    notes : about the sensors of calibrations, and about topics
-    compared_models : the rows of this log's own models; None where they were left out
-    left_out : why they were left out
+    notes : findings about the sensors of calibrations, and about topics
+    compared_models : the rows of this log's own models; None if they were left out
+    left_out : reason for which they were left out
     """
 
     of_calibrations: Sequence[ComparedRow]
@@ -358,7 +358,7 @@ def _tested_rows(
 
 
 def _contradicted(run: Run, errors: report.OpenLoopErrors, why: Note) -> tuple[Run, report.OpenLoopErrors]:
-    """Return a run and its errors as not usable. The errors stay in the report: they show the contradiction."""
+    """Return a run and its errors, marked as not usable; the errors stay in the report to show the contradiction."""
     document = msgspec.structs.replace(
         run.document, usable=False, unusable_because=why.text, recommended=None, notes=(*run.document.notes, why)
     )
@@ -371,7 +371,7 @@ def _scored_topics(request: ReportRequest, log: str | Path | None) -> Sequence[T
     Raises
     ------
     ConfigError
-        There is no log to read them from, or a topic that cannot be used.
+        There is no log to read the topics from, or a topic cannot be used.
     LogError
         The log cannot be read.
     """
@@ -379,7 +379,7 @@ def _scored_topics(request: ReportRequest, log: str | Path | None) -> Sequence[T
         return ()
     if log is None:
         why = "a run holds no poses of other topics, and opens no log by itself"
-        raise ConfigError("score", why, "give the log that it was made of")
+        raise ConfigError("score", why, "give the log that the run was made of")
     return read_topic_poses(log, list(dict.fromkeys(request.score)))
 
 
@@ -396,9 +396,9 @@ def _report(
 
     Parameters
     ----------
-    errors : errors of its models
-    with_events : errors of all trials; given where `errors` leaves out the trials that cross a slip event
-    notes : notes about the rows, in addition to the run's notes
+    errors : errors of the models of the run
+    with_events : errors of all trials, if `errors` leaves out the trials that cross a slip event
+    notes : notes about the rows, in addition to the notes of the run
     """
     calibration = None if compared_models is None else compared_models.calibration
     notes = (*run.notes, *(() if compared_models is None else compared_models.notes), *notes)
@@ -438,7 +438,7 @@ def _report(
         reference_error=errors.reference,
         by_learning=errors.by_learning,
         calibrations=calibrations,
-        # Without the date: the same run gives the same file.
+        # The date is left out, so that the same run gives the same file.
         recommended=None if calibration is None else msgspec.structs.replace(calibration, created=UNSET),
         budgets=budgets,
         best=report.best_row(errors, calibrations) if usable else None,
@@ -463,7 +463,7 @@ def _counts(
     errors: report.OpenLoopErrors, with_events: report.OpenLoopErrors | None
 ) -> Iterator[documents.CountDocument]:
     """Yield how many starts gave a trial at each horizon, and why the others gave none."""
-    # The reasons are counted over all trials: with the option, a slip event would be counted as a gap.
+    # The reasons are counted over all trials. With --without-events a slip event would be counted as a gap.
     counts = (with_events or errors).counts
     crossing = counts.trials - errors.counts.trials
     driven = distance_text(errors.run_document.drive.distance_m)
@@ -489,7 +489,7 @@ def _ladder(
     compared_models: ComparedModels | None,
     why_none: str,
 ) -> documents.LadderDocument:
-    """Return how the models were compared, or why the comparison was left out."""
+    """Return the comparison of the models, or why it was left out."""
     if compared_models is None:
         return documents.LadderDocument(left_out=why_none)
     of_calibrations, turned = {used.name for used in calibrations}, f"_{compared_models.heading}"
@@ -521,20 +521,20 @@ def _ladder(
 
 
 def forced_lengths_s(run: Run, request: ReportRequest) -> Sequence[float]:
-    """Return the lengths [s] of outages to force: from the request, else from the run's configuration."""
+    """Return the lengths [s] of the forced outages, from the request or else from the run's configuration."""
     return request.outage_s if request.outage_s is not None else run.config.dropout.forced_outage_s
 
 
 def with_other_grounds(
     budgets: Iterable[BudgetDistance], calibrations: Sequence[UsedCalibration]
 ) -> tuple[BudgetDistance, ...]:
-    """Return the distances within budgets; rows of calibrations also get their interval on another ground."""
+    """Return the distances within budgets; for rows with a calibration, with the interval on another ground."""
     scores = {
         used.name: used.calibration.other_grounds or ()
         for used in calibrations
         if used.calibration is not None and not used.fitted_to_this
     }
-    # row ``adaptive`` begins with the first calibration that was not fitted to this log
+    # Row ``adaptive`` begins with the first calibration that was not fitted to this log.
     first = next(iter(scores.values()), ())
     distances = []
     for reach in budgets:
@@ -552,7 +552,7 @@ def with_other_grounds(
 def _calibration_rows(
     run: Run, past: Run, calibrations: Sequence[Calibration], request: ReportRequest
 ) -> tuple[tuple[UsedCalibration, ...], list[ComparedRow], list[Note]]:
-    """Return the record of each used calibration, the models of their rows, and notes about their sensors.
+    """Return the record of each used calibration, the rows of the calibrations, and notes about their sensors.
 
     `past` is the run with the poses of the filter.
     """

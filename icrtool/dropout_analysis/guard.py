@@ -1,4 +1,4 @@
-"""Whether the rows of a report can be used: enough trials in each, and no contradiction between rows."""
+"""Check of the rows of a report: each needs enough trials, and two rows must not contradict each other."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.run_document import RunDocument
 
 FEWEST_TRIALS = 30
-"""Number of trials that a row needs. The 95th percentile of fewer trials is their largest or second largest error."""
+"""Smallest number of trials of a row. The 95th percentile of fewer trials is their largest or second largest error."""
 
 SMALLEST_SHARE_TRIED = 0.1
-"""Share of the starts for which a row needs an error. With less, only a chosen part of the drive was tested."""
+"""Smallest share of the starts for which a row has an error. With less, only a part of the drive was tested."""
 
 LARGEST_ROW_RATIO = 3.0
-"""Ratio of the errors of `recommended` and `icr` from which on they contradict each other."""
+"""Ratio of the errors of `recommended` and `icr` above which the two rows contradict each other."""
 
 
 def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterable[str]) -> Note | None:
-    """Return why the rows of a report must not be used; None where they can be.
+    """Return why the rows of a report must not be used; None if they can be used.
 
     Parameters
     ----------
     summary : document of the run
     errors : errors of the rows
-    held_out : names of the rows that are tested on distance they were not fitted to
+    held_out : names of the rows that are tested on distance that they were not fitted to
 
     Notes
     -----

@@ -1,7 +1,7 @@
 """The dropout report, and its comparison with budgets, acceptance limits for CI and an earlier report.
 
-`icrtool.dropout` and `icrtool.dropout_report` return a `DropoutReport`. It is not in `icrtool.records` because it holds
-a calibration, which depends on fits. The code that computes a report is in other modules.
+`icrtool.dropout` and `icrtool.dropout_report` return a `DropoutReport`. The record is not in `icrtool.records`, because
+it holds a calibration, which depends on fits. Other modules compute a report.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ class OpenLoopErrors:
     ----------
     run_document : content of the run's run.json
     horizons_m : (h,) ascending
-    results : one per model
-    counts : trials, and starts without a trial, by horizon; the same for every model
+    results : result of each model
+    counts : number of trials, and of starts without a trial, by horizon; they are the same for every model
     states : number of recorded states
     standing : number of states in which the robot stood; the trials of one standstill are nearly equal
     reference : errors that a perfect model would show, by horizon
-    by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
+    by_learning : errors of the momentary ICRs before and after the ICRs were first learned; None without this model
     """
 
     run_document: RunDocument
@@ -86,7 +86,7 @@ class OpenLoopErrors:
     by_learning: documents.LearnedDocument | None
 
     def result(self, model: str) -> documents.ModelResult | None:
-        """Return the result of a model, None when it was not computed."""
+        """Return the result of a model; None if it was not computed."""
         return next((result for result in self.results if result.name == model), None)
 
 
@@ -99,13 +99,13 @@ class DropoutReport(OpenLoopErrors):
     Attributes
     ----------
     document : content of report.json
-    run_directory : directory that the run was read from; None for a run just made
+    run_directory : directory that the run was read from; None for a new run
     reference_north_m, reference_east_m : (n,) positions that trials are compared with, at every state
-    usable : distances and numbers may be used, or the request accepts an unusable run
+    usable : whether distances and numbers may be used, because the run is usable or the request accepts any run
     worst, examples, outages : the same as in `document`, with their paths
-    path_errors : errors of all trials of the row in `worst`, by start; None where no trial is long enough
-    calibration : the model of row `recommended`, fitted to this run alone; None where it was left out
-    baseline : an earlier report that this report is compared with
+    path_errors : errors of all trials of the row in `worst`, by start; None if no trial is long enough
+    calibration : the calibration from this run alone; None if it was left out
+    baseline : an earlier report that this report is compared with; None without one
     """
 
     document: documents.DropoutDocument
@@ -146,20 +146,20 @@ class DropoutReport(OpenLoopErrors):
 
         Parameters
         ----------
-        path : directory of the report; default: ``dropout`` in the directory the run was read from
+        path : directory of the report; default: ``dropout`` in the directory that the run was read from
         plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
         figures : ``all``: the paper's figures too
 
         Raises
         ------
         OutputError
-            Something that is not a dropout report is there, or the disk does not take it.
+            A file or directory that is not a dropout report is there, or a file cannot be written.
         """
         from icrtool.output.dropout_directory import write_report
 
         if path is None:
             if self.run_directory is None:
-                raise ValueError("path: this run was not read from a directory; name one for its report")
+                raise ValueError("path: the run was not read from a directory; name a directory for its report")
             path = self.run_directory / "dropout"
         write_report(lambda _: self, Path(path), plots=plots, figures=figures)
 
@@ -178,13 +178,13 @@ class DropoutReport(OpenLoopErrors):
 
 @dataclass(frozen=True, slots=True)
 class BaselineReport:
-    """An earlier report.
+    """An earlier report that a report is compared with.
 
     Attributes
     ----------
     log : name of the log; path : path of the report
     document : content of the report
-    drives : of `pooled_baseline`, the reports whose mean is `document`; otherwise empty
+    drives : the reports whose mean is `document`, from `pooled_baseline`; empty for a single report
     """
 
     log: str
@@ -194,7 +194,7 @@ class BaselineReport:
 
     @property
     def sha256(self) -> tuple[str, ...]:
-        """SHA-256 of each file of the log; empty where the SHA-256 of one file is not known."""
+        """SHA-256 of each file of the log; empty if the SHA-256 of a file is not known."""
         return known_content(file.sha256 for file in self.document.run.inputs)
 
     @property
@@ -203,7 +203,7 @@ class BaselineReport:
         return escaped(self.document.tool_version)
 
     def at(self, model: str, horizon_m: float) -> tuple[documents.ErrorRow | None, BlockSums | None]:
-        """Return the numbers of a model at a horizon, and their block sums; None where the report has none."""
+        """Return the numbers of a model at a horizon, and their block sums; None if the report does not have them."""
         for result in self.document.models:
             for row in result.by_horizon:
                 if result.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6):
@@ -224,7 +224,7 @@ class BaselineReport:
         return None, None
 
     def number_for(self, gate: Gate) -> tuple[float, BlockSums | None]:
-        """Return the number [m] that a limit bounds, NaN where there is none, and its block sums.
+        """Return the number [m] that a limit bounds, NaN if the report has none, and its block sums.
 
         Raises
         ------
@@ -251,35 +251,36 @@ class BaselineReport:
         differences = []
         if not self.is_of(run_document):
             differences.append(
-                f"another recording than in the baseline ({self.log}): the difference has a wider interval"
+                f"the recording differs from the baseline ({self.log}), so the difference has a wider interval"
             )
         keys = sorted(_different_keys(self.document.run.config.effective(), run_document.config.effective()))
         if keys:
-            differences.append(f"another configuration than in the baseline: {listed(keys, 5)}")
+            differences.append(f"the configuration differs from the baseline: {listed(keys, 5)}")
         if self.tool_version != __version__:
-            differences.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
+            differences.append(f"icrtool is {__version__}, and the baseline was made with {self.tool_version}")
         return tuple(differences)
 
     def is_of(self, run_document: RunDocument) -> bool:
-        """Return whether the report was made of the same recording as a run."""
+        """Return whether the report is of the same recording as a run."""
         return not self.drives and bool(self.sha256) and self.sha256 == run_document.content
 
     def half_width(
         self, model: str, horizon_m: float, metric: str, now: BlockSums | None, factor: float, *, same: bool
     ) -> float:
-        """Return half the 95 % interval [m] of ``number - factor * baseline``; NaN where there is none.
+        """Return half the 95 % interval [m] of ``number - factor * baseline``; NaN if there is no interval.
 
         Parameters
         ----------
+        model, horizon_m, metric : row, distance and name of the number
         now : block sums of the number
+        factor : factor of the baseline
         same : number and baseline are of the same recording
 
         Notes
         -----
-        With pooled drives two half widths are added in squares. The first comes from the variance between drives,
-        once for the new drive and once for the mean of the others. This variance is pooled from the given drives and
-        other robots (`icrtool.kernels.error_statistics.pooled_variance`). The second comes from the blocks of the new
-        drive.
+        For pooled drives, the squares of two half widths are added. The first comes from the variance between drives,
+        which counts for the new drive and for the mean of the others. It is pooled from the given drives and other
+        robots (`icrtool.kernels.error_statistics.pooled_variance`). The second comes from the blocks of the new drive.
         """
         if not self.drives:
             return difference_half_width(now, self.at(model, horizon_m)[1], metric, factor, paired=same)
@@ -298,11 +299,11 @@ class BaselineReport:
 
 
 def pooled_baseline(drives: Sequence[documents.DropoutDocument], log: str, path: str) -> BaselineReport:
-    """Return the reports of several drives as one baseline; the drive to compare is not one of them.
+    """Return the reports of several drives as one baseline.
 
     Parameters
     ----------
-    drives : at least one, of the same robot
+    drives : reports of at least one drive of the same robot, without the drive that is compared
     log : name of the baseline; path : place of the reports
 
     Notes
@@ -326,7 +327,7 @@ _ERROR_COLUMNS = tuple(name for name in documents.SummaryRow.__struct_fields__ i
 
 
 def _numbers_of(drives: Sequence[documents.DropoutDocument], model: str, horizon_m: float, name: str) -> Floats:
-    """Return one number of a row at a horizon, of each drive that has it."""
+    """Return a number of a row at a horizon in each drive that has it (d,)."""
     rows = [
         row
         for drive in drives
@@ -339,10 +340,12 @@ def _numbers_of(drives: Sequence[documents.DropoutDocument], model: str, horizon
 
 
 def _positive(numbers: Floats) -> Floats:
+    """Return the numbers above zero."""
     return np.asarray(numbers[numbers > 0.0])
 
 
 def _different_keys(before: Mapping[str, object], now: Mapping[str, object], prefix: str = "") -> Iterator[str]:
+    """Yield the keys at which two configurations differ."""
     for key in {*before, *now}:
         old, new = before.get(key), now.get(key)
         if isinstance(old, Mapping) and isinstance(new, Mapping):
@@ -352,12 +355,12 @@ def _different_keys(before: Mapping[str, object], now: Mapping[str, object], pre
 
 
 def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDistance, ...]:
-    """Return how far the 95th percentile of each model stays within a budget [m]; models without trials are left out.
+    """Return the distance up to which p95 of each model stays within a budget [m]; models without trials are left out.
 
     Raises
     ------
     ConfigError
-        The budget is no length.
+        The budget is not a positive number.
     """
     if not (math.isfinite(budget_m) and budget_m > 0):
         raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
@@ -369,7 +372,7 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
                 within_budget(report.horizons_m, result.column(name), budget_m)
                 for name in ("p95_high_m", "p95_low_m", "p95_next_high_m", "p95_next_low_m")
             )
-            # No distance is known for a bound that stays within the budget at every horizon with an interval.
+            # A bound that stays within the budget at every horizon with an interval has no distance.
             low, high, next_low, next_high = (None if end is None or end[1] else end[0] for end in ends)
             quiet = documents.column_of(result.without_events, "p95_m")
             free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
@@ -382,21 +385,21 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
 def best_row(
     errors: OpenLoopErrors, calibrations: Sequence[documents.UsedCalibration] = ()
 ) -> documents.BestRow | None:
-    """Return the best row for driving by wheels alone; None where no row that a robot can drive with has trials.
+    """Return the best row for driving by wheels alone; None if no row that a robot can drive with has trials.
 
     Parameters
     ----------
-    calibrations : calibrations of the report; one that was fitted to this log is not compared
+    calibrations : calibrations of the report; a calibration that was fitted to this log is not compared
 
     Notes
     -----
-    The best row has the smallest expected error near 10 m; a mean has less random variation than a percentile. A row
-    for comparison is equally good if its expected error is smaller; or if it is larger by less than the interval of the
-    difference, and the intervals of both expected errors overlap. The difference alone is not enough: where all turns
-    of a drive lie in one block, its interval is wider than any error.
+    The best row has the smallest expected error near 10 m, because a mean has less random variation than a percentile.
+    A row for comparison is as good if its expected error is smaller, or if it is larger by less than the interval of
+    the difference and the intervals of both expected errors overlap. The difference alone is not enough: if all turns
+    of a drive lie in one block of path, its interval is wider than any error.
     """
     not_compared = {used.name for used in calibrations if used.fitted_to_this}
-    # A localisation in the log uses further sensors.
+    # A scored topic is not compared, because the localisation on the robot uses further sensors.
     not_compared |= {result.name for result in errors.results if kind_of(result.name) == TOPIC_ROW}
     rows = {
         result.name: row_of(result.name)
@@ -425,19 +428,21 @@ def best_row(
 
 
 ROOT_HALF = math.sqrt(0.5)
-"""Ratio of two errors if the square of the first is half of the square of the second.
+"""Ratio of two errors below which the square of the first is less than half of the square of the second.
 
-Squares are compared because independent parts of an error add in squares."""
+Squares are compared because the squares of independent parts of an error add up."""
 
 ESTIMATED_HEADINGS = ("gyro_course", "wheels_course")
-"""Sources of a heading that no sensor measures."""
+"""Sources of headings that no sensor measures."""
 
 
 def start_heading(result: documents.ModelResult, h: int, source: str) -> documents.StartHeading | UnsetType:
-    """Return how much of the error at horizon number `h` comes from the start headings; UNSET where it is not known.
+    """Return how much of the error comes from the headings at the starts; UNSET if it is not known or small.
 
     Parameters
     ----------
+    result : result of a row
+    h : number of the horizon
     source : source of the heading, as in run.json
     """
     aligned = result.aligned[h] if result.aligned else None
@@ -471,7 +476,9 @@ def parse_gate(text: str) -> Gate:
         raise ConfigError(f"gate {text!r}", f"not of the form {form}", example)
     at_m, within = float(match["at"]), match["metric"] in DISTANCES
     if not at_m > 0:
-        raise ConfigError(f"gate {text!r}", "0 m is no length", "name one above zero, for example @10m")
+        raise ConfigError(
+            f"gate {text!r}", "its distance or error is 0 m", "give a number above zero, for example @10m"
+        )
     factor = float(match["factor"] or 1.0) if match["baseline"] else 0.0
     bound_m = float((match["bound"] or match["offset"] or "0").replace(" ", ""))
     if not all(map(math.isfinite, (at_m, factor, bound_m))):
@@ -489,13 +496,14 @@ def check_gate(
 
     Parameters
     ----------
-    baseline : earlier report for limits relative to it; without one such a limit is not checked
-    strict : a relative limit fails if the number exceeds it; otherwise only if the excess is beyond the interval
+    gate, report : the limit, and the report
+    baseline : earlier report, for limits relative to it; without it such a limit is not checked
+    strict : a relative limit fails if the number is beyond it; otherwise only if the interval of the margin is, too
 
     Raises
     ------
     ConfigError
-        A model or horizon that the report, or the baseline, does not have.
+        The report or the baseline has no such model or horizon.
     """
     if (result := report.result(gate.model)) is None:
         choices = ", ".join(result.name for result in report.results)
@@ -537,6 +545,7 @@ def verdict_on(gate: Gate, log: str, *, passed: bool, **found: float | str | Non
 
     Parameters
     ----------
+    gate, log, passed : the limit, the name of the log, and whether the limit is met
     found : further fields of `Verdict`; a number that is not finite becomes None
     """
     fields = {"value_m": None} | {name: plain_value(value) for name, value in found.items()}

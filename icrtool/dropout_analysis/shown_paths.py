@@ -1,4 +1,4 @@
-"""Paths without GNSS that are shown one by one: worst and typical trials, forced outages, and the log's outages."""
+"""Paths without GNSS that are shown one by one: worst and typical trials, forced outages, outages of the log."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WORST_HORIZON_M = 10.0
 """Distance of the worst trials [m]."""
 
 MOST_ON_PATH = 20_000
-"""Largest number of trials whose errors are kept by their start: a picture has some thousand places."""
+"""Largest number of trials whose errors are kept for pictures. A picture shows some thousand places."""
 
 EXAMPLE_HORIZON_M = 15.0
 """Distance of the typical trials [m], as in Figs. 33 and 34 of Pentzer 2014."""
@@ -43,27 +43,30 @@ STRAIGHT_SHARE, LONGEST_CHORD = 0.05, 1.1
 """Share of the trials that count as straight, and largest ratio of a chord to its distance."""
 
 TYPICAL_OF = 30
-"""Approximate number of trials from which the typical one, with the median error, is chosen."""
+"""Approximate number of trials of which the trial with the median error is the typical one."""
 
 LONGEST_SHARE = 0.5
-"""Largest share of the moving time that spaced outages take. The filter learns in the rest."""
+"""Largest share of the moving time in evenly spaced outages. The filter learns in the rest of the time."""
 
 MOST_SPACED = 10
 """Largest number of evenly spaced outages."""
 
 SAME_M = 1e-6
-"""Largest difference [m] between disturbed and undisturbed run before the first outage. They differ only by
-rounding."""
+"""Largest difference between the run with forced outages and the original run before the first outage [m]. Both differ
+only by rounding."""
 
 FIXES_COMPARED_S = 1.0
-"""Time after an outage whose fixes are compared with the open-loop path [s]. The path is driven on for this time."""
+"""Time after an outage in which fixes are compared with the open-loop path [s]. The path goes on for this time."""
 
 
 class StartErrors(NamedTuple):
-    """The end errors of the trials of one length, of the row `name`, and the states at which they end.
+    """Errors of the trials of one length by start, and the states at which the trials end.
 
-    `error_m` (n,) [m] and `end` (n,) have an entry for each state at which a trial may start; an error is NaN where no
-    trial starts.
+    Attributes
+    ----------
+    name : row of the trials
+    error_m : (n,) error of the trial that starts at each state [m]; NaN if no trial starts there
+    end : (n,) state at which this trial ends
     """
 
     name: str
@@ -73,7 +76,7 @@ class StartErrors(NamedTuple):
 
     @property
     def on_path(self) -> PathErrors | None:
-        """The errors alone, of at most `MOST_ON_PATH` starts, the largest among them; None where there is no trial."""
+        """Errors of at most `MOST_ON_PATH` starts, with the largest errors among them; None if there is no trial."""
         start = np.flatnonzero(np.isfinite(self.error_m))
         if not len(start):
             return None
@@ -85,11 +88,13 @@ class StartErrors(NamedTuple):
 def errors_by_start(
     run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, *, starts: Starts = "moving"
 ) -> StartErrors:
-    """Return the error of each trial of one length: of row ``recommended``, or if it is missing, of the momentary ICRs.
+    """Return the errors of the trials of one length, of row ``recommended`` or else of the momentary ICRs.
 
     Parameters
     ----------
-    compared : held-out models
+    compared : the held-out models, with row ``recommended``; None: without them
+    horizon_m : length of the trials [m]
+    starts : states that trials start from
     """
     track, icrs = track_of(run), models_of(run)[0]
     ends = counted_ends(track, np.array([horizon_m]), starts)
@@ -108,13 +113,14 @@ def worst_trials(
     run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT, *,
     starts: Starts = "moving", further: Sequence[ComparedRow] = (), errors: StartErrors | None = None,
 ) -> tuple[ExampleTrial, ...]:  # fmt: skip
-    """Return the trials with the largest error that do not overlap, worst first.
+    """Return the trials with the largest errors that do not overlap, the largest first.
 
     Parameters
     ----------
     compared, horizon_m, starts : as in `errors_by_start`
+    count : largest number of trials
     further : further rows whose paths are shown
-    errors : result of `errors_by_start`, if it was computed before
+    errors : result of `errors_by_start`; default: it is computed
     """
     of_starts = errors_by_start(run, compared, horizon_m, starts=starts) if errors is None else errors
     track, models, ends = track_of(run), models_of(run), of_starts.end
@@ -132,16 +138,17 @@ def worst_trials(
 
 
 def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[ExampleTrial, ...]:
-    """Return a typical cornering trial and a typical straight one, none when no trial is that long.
+    """Return a typical cornering trial and a typical straight trial; none if no trial is `horizon_m` long.
 
     Notes
     -----
-    Cornering trials: the change of heading is closest to half a turn. Straight trials: the 5 % of the trials that end
-    furthest from their start. The typical trial of each group has its median error, with the momentary ICRs.
+    Cornering trials are the trials whose change of heading is closest to half a turn. Straight trials are the 5 % of
+    the trials that end furthest from their start. The typical trial of each group has the median error of the group,
+    with the momentary ICRs.
     """
     track, models = track_of(run), models_of(run)
     ends = trial_ends(track, np.array([horizon_m]))[:, 0]
-    # Starts during a stop repeat the same path: only the last state of each stop is used.
+    # Starts during a stop repeat the same path, so only the last state of each stop is used.
     moving = np.flatnonzero((ends >= 0) & ~standing_states(track))
     if not len(moving):
         return ()
@@ -151,10 +158,10 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
         return np.asarray(column[reached] - column[moving])
 
     chord = np.hypot(change(track.north), change(track.east))
-    # A chord longer than the distance that the wheels rolled: the reference jumped.
+    # If a chord is longer than the distance that the wheels rolled, the reference jumped.
     chord[chord > LONGEST_CHORD * horizon_m] = 0.0
     straight = moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)]
-    del chord  # a column of a long log is large
+    del chord  # A column of a long log is large.
     off = np.abs(np.abs(change(track.heading)) - np.pi)
     examples = []
     for group in (moving[off <= off.min() + ALIKE_RAD], straight):
@@ -197,16 +204,17 @@ def _example(
 
 
 def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple[tuple[int, int], ...]:
-    """Return outages of one length: at given seconds, or spaced over the time in which the robot moves.
+    """Return outages of one length as half-open spans [ns], in order of time.
 
-    Returns
-    -------
-    Half-open spans [ns], in order.
+    Parameters
+    ----------
+    length_s : length of the outages
+    at_s : begins of the outages, in seconds since the first state; empty: evenly spaced over the moving time
 
     Raises
     ------
     ConfigError
-        An outage does not fit into the drive or into the time between two others, or overlaps an outage of the log.
+        An outage does not fit into the drive or before the next outage, or overlaps an outage of the log.
     """
     last = float(run.table.t_s[-1])
     if not length_s > 0:
@@ -228,18 +236,22 @@ def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple
 
 
 def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage, ...]:
-    """Return forced outages: the filter runs again without GNSS and heading in the spans, next to the undisturbed run.
+    """Return forced outages: the filter runs again without GNSS and heading in the spans, and both runs are compared.
+
+    Parameters
+    ----------
+    spans_ns : half-open spans, in order of time
 
     Raises
     ------
     ConfigError
-        A span holds fewer than two states of the disturbed run.
+        A span holds fewer than two states of the new run.
     DataError
         The run cannot be made again.
     """
     setup = set_up_again(run, tuple(spans_ns))
     output = run_ekf(*setup)
-    # An outage at the start delays the first state of the disturbed run: rows are matched from the end.
+    # An outage at the start delays the first state of the new run, so rows are counted from the end.
     rows = min(len(output.x), len(run.table))
     north, east = output.x[-rows:, 0], output.x[-rows:, 1]
     away = np.hypot(north - run.table.north_m[-rows:], east - run.table.east_m[-rows:])
@@ -263,18 +275,18 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
 
 
 def _own_outages_s(run: Run) -> Floats:
-    """Return the spans (k, 2) [s] of the outages that the log has itself."""
+    """Return the spans (k, 2) [s] of the outages of the log."""
     return np.asarray((run.outages_ns - int(run.table.stamp_ns[0])) / 1e9)
 
 
 def _meets(begin_s: Floats, length_s: float, spans_s: Floats) -> Bools:
-    """Return which outages of a length, by their begins (k,) [s], share time with one of the ordered spans (m, 2)."""
+    """Return which outages of a length, with begins (k,) [s], overlap one of the ordered spans (m, 2) [s]."""
     following = np.searchsorted(spans_s[:, 1], begin_s, side="right")
     return np.asarray(np.append(spans_s[:, 0], np.inf)[following] < begin_s + length_s)
 
 
 def _spaced(run: Run, length_s: float) -> list[float]:
-    """Return the begins [s] of outages, evenly spaced in the moving time after convergence; half of it stays free.
+    """Return the begins [s] of outages that are evenly spaced in half of the moving time after convergence.
 
     No outage begins where it would overlap an outage of the log, a gap in the wheel data or a jump of the reference.
     """
@@ -297,12 +309,12 @@ def _spaced(run: Run, length_s: float) -> list[float]:
 
 
 def real_outages(run: Run) -> tuple[Outage, ...]:
-    """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix before.
+    """Return the GNSS outages of the log, with the open-loop path by the ICRs of the last fix before each.
 
-    The end error is the distance to the fixes that ended the outage, not to the filter, because the filter used only
-    its wheels in the outage and has the same error as the open-loop path. Three kinds of outages are left out: outages
-    that never end and outages with a gap in the wheel data have no end error; before an outage at the begin of the
-    drive neither position nor ICRs were known.
+    The end error is the distance to the fixes after the outage. The filter has the same error as the open-loop path,
+    because it used only the wheels in the outage. Three kinds of outages are left out: outages without an end and
+    outages with a gap in the wheel data, because they have no end error, and an outage at the begin of the drive,
+    because neither position nor ICRs were known before it.
     """
     track, table, fixes = track_of(run), run.table, run.sensors.fixes
     (forward, right), origin = run.sensors.facts.antenna_m, int(table.stamp_ns[0])
@@ -316,7 +328,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         after = last + int(gaps[0]) if len(gaps) else min(after, len(table) - 1)
         path = open_loop_path(track, *table.icrs_at(first), first, after)
         stamps = table.stamp_ns[first : after + 1]
-        # distance from the antenna on the path to each used fix after the outage
+        # The error of each used fix after the outage is its distance from the antenna on the path.
         rows = np.flatnonzero(run.gnss.used & (fixes.stamp_ns >= end) & (fixes.stamp_ns <= max(end, stamps[-1])))
         cos, sin = np.cos(path.heading), np.sin(path.heading)
         at, state_s = (fixes.stamp_ns[rows] - stamps[0]) / 1e9, (stamps - stamps[0]) / 1e9

@@ -81,7 +81,7 @@ def test_a_gyro_of_the_other_sign_is_turned_and_reported(run: Run) -> None:
     usual, turned = (compared_errors(run, [MeasuredHeading("gyro", sign * angle)]) for sign in (1, -1))
     known = {one.text for one in usual[0].notes}
     assert {one.text for one in turned[0].notes} - known == {
-        "the gyro counts turns in the other direction: its sign was changed"
+        "the gyro counts turns in the other direction; its sign was changed"
     }
     for name, errors in usual[1].items():
         assert np.allclose(errors, turned[1][name], atol=ROUNDING_M, equal_nan=True)
