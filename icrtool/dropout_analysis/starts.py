@@ -1,7 +1,7 @@
 """Start states of open-loop trials, and the reference that trials are compared with.
 
-The module finds the state from which on the ICRs were learned and the trials that turn. The reference is the filter's
-or the smoother's estimate; its own error is computed here, too.
+The module finds the state at which the ICRs were learned, and the trials that turn. The reference is the estimate of
+the filter or of the smoother; the module also computes the error of the reference itself.
 """
 
 from __future__ import annotations
@@ -28,18 +28,24 @@ from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 
 STANDING_MPS = 0.01
-"""Speed of both tracks below which the robot stands [m/s]."""
+"""Speed of both sides below which the robot stands [m/s]."""
 
 
 def standing_states(track: Track) -> Bools:
-    """Return the states (n,) after which the robot stands; False for the last state, which has no interval."""
+    """Return which states (n,) begin an interval in which the robot stands; False for the last state."""
     standing: Bools = (np.abs(track.v_left) < STANDING_MPS) & (np.abs(track.v_right) < STANDING_MPS)
     standing[-1:] = False
     return standing
 
 
 def counted_ends(track: Track, horizons_m: Floats, counted: Starts, starts: Ints | None = None) -> Rows:
-    """Return the ends of trials (`ends_from`) from `starts`, else all states; starts that do not count are marked."""
+    """Return the ends (k, h) of trials, as `ends_from` does; a start that does not count ends at `STANDING`.
+
+    Parameters
+    ----------
+    counted : ``moving``: each standstill counts once; ``all``: every state counts
+    starts : (k,) states that trials start from; default: all states
+    """
     starts = starts if starts is not None else np.arange(len(track.distance))
     ends = ends_from(track, horizons_m, starts)
     if counted == "moving":
@@ -50,15 +56,15 @@ def counted_ends(track: Track, horizons_m: Floats, counted: Starts, starts: Ints
 
 
 def first_learned(run: Run) -> int | None:
-    """Return the first state at which all ICRs were learned; None where they never were.
+    """Return the first state at which all ICRs were learned; None if they never were.
 
     Notes
     -----
     An ICR is learned when its standard deviation has made 90 % of its decrease (`icrtool.estimation.convergence`).
-    Pentzer 2014 (Section 5.2) applies the same criterion to the estimate. The standard deviation is used here because
-    the final estimate is not known at the start of a trial. If the standard deviation of an ICR does not decrease by
-    half, the ICR was known from the start if its standard deviation is at most `WEAK_SHARE` of y_right - y_left, the
-    limit of "weakly shown"; otherwise it is never learned. A warm start has learned the ICRs before the first state.
+    Pentzer 2014 (Section 5.2) applies this criterion to the estimate. The standard deviation is used here, because the
+    final estimate is not known at the start of a trial. An ICR whose standard deviation does not decrease by half was
+    known from the start if its standard deviation is at most `WEAK_SHARE` of y_right - y_left, the limit of "weakly
+    shown"; otherwise it is never learned. With a warm start, the ICRs are known from the first state on.
     """
     if run.began_with is not None:
         return 0
@@ -74,17 +80,17 @@ def first_learned(run: Run) -> int | None:
 
 
 DRAWS = 20_000
-"""Number of errors drawn for each horizon. With this number p95 is known to 1 %."""
+"""Number of errors that are drawn for each horizon. With this number, p95 is known to 1 %."""
 
 POSE = ("north_m", "east_m", "heading_rad")
 """Columns of the states that the reference consists of."""
 
 GNSS_NIS, HEADING_NIS = 2.0, 1.0
-"""Expected mean NIS of fixes and of headings if the noise is right: the number of measured components."""
+"""Expected mean NIS of fixes and of headings, if the noise is right: the number of measured components."""
 
 
 class DrawnTrials(NamedTuple):
-    """Trials of one horizon [m]: the states at which they start and end; empty where the horizon has no trial."""
+    """Drawn trials of one horizon [m]: the states at which they start and end; empty if the horizon has no trial."""
 
     horizon_m: float
     start: Ints
@@ -92,7 +98,10 @@ class DrawnTrials(NamedTuple):
 
 
 def drawn_trials(horizons_m: Floats, ends: Rows) -> list[DrawnTrials]:
-    """Return `DRAWS` trials of each horizon (h,), or none; `ends` (h, n) are the states at which trials end."""
+    """Return `DRAWS` trials of each horizon (h,) [m], none for a horizon without trials.
+
+    `ends` (h, n) has the state at which the trial from each state ends.
+    """
     drawn = []
     for horizon_m, column in zip(horizons_m.tolist(), ends, strict=True):
         start = np.flatnonzero(column >= 0)
@@ -103,13 +112,13 @@ def drawn_trials(horizons_m: Floats, ends: Rows) -> list[DrawnTrials]:
 
 
 def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int) -> tuple[ReferenceRow, ...]:
-    """Return the error in the trials of each horizon that comes from the reference.
+    """Return the errors that a perfect model would have in trials, because the reference has errors.
 
     Parameters
     ----------
-    run : its states are the reference
+    run : run whose states are the reference
     trials : trials of each horizon, in groups
-    seed : seed of the draws; each group begins with this seed again
+    seed : seed of the draws; each group begins with this seed
 
     Notes
     -----
@@ -126,7 +135,7 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
     offset common to the whole log is not in the variances.
     """
     table, noise = run.table, run.document.filter
-    # Ratios of measured to assumed variance of fixes and headings; at least 1.
+    # The variances are multiplied by the ratios of measured to assumed variance, if these are above 1.
     position = max((noise.nis_gnss_mean or 0.0) / GNSS_NIS, 1.0)
     heading = max((noise.nis_heading_mean or 0.0) / HEADING_NIS, 1.0)
     every = [trial for group in trials for trial in group]
@@ -134,7 +143,7 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
     def at_ends(column: Floats) -> list[tuple[Floats, Floats]]:
         return [(column[trial.start], column[trial.end]) for trial in every]
 
-    # columns are read one after the other: a run that was read back may not hold them in memory
+    # The columns are read one after the other, because a run from a file may not hold them in memory.
     stds = at_ends(table.std_north_m), at_ends(table.std_east_m), at_ends(table.std_heading_rad)
     generators = (rng for group in trials for rng in repeat(np.random.default_rng(seed), len(group)))
     rows = []
@@ -168,11 +177,11 @@ def with_smoothed_reference(run: Run) -> Run:
 
     Notes
     -----
-    Starts, their ICRs, the wheel speeds and the path length are still the filter's. Only the pose at the start of a
-    trial and the position that its end is compared with change.
+    Only the pose at the start of a trial and the position that its end is compared with change. Starts, ICRs, wheel
+    speeds and path length stay as in the filter.
     """
     if run.smoothed is None:
-        raise RunError(run.directory or run.name, "it has no smoothed states", "run icrtool fit --smooth")
+        raise RunError(run.directory or run.name, "has no smoothed states", "run icrtool fit --smooth")
     smoothed = {name: getattr(run.smoothed, name) for pose in POSE for name in (pose, f"std_{pose}")}
     return replace(run, table=run.table.changed(**smoothed))
 
@@ -184,7 +193,7 @@ STRAIGHT_RAD = math.radians(10.0)
 """Largest range of the headings of a straight trial [rad]."""
 
 CELLS_A_HORIZON = 20
-"""Number of cells of path in a horizon, to find the range of the heading."""
+"""Number of cells of path in a horizon, in which the range of the heading is found."""
 
 SPLIT_MODELS = ("icr", "no_slip")
 """Rows whose straight and turning trials are compared."""
@@ -193,7 +202,7 @@ SPLIT_MODELS = ("icr", "no_slip")
 def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
     """Return the errors of straight and turning trials of `SPLIT_HORIZON_M` (Pentzer 2014, Section 6.4, Figs. 33-34).
 
-    A trial turns if the range of the heading over its path is large, so an S-curve is a turn. A part without trials is
+    A trial turns if the range of the heading over its path is large, so an S-curve is a turn. A group without trials is
     left out.
     """
     track = track_of(run)
@@ -213,8 +222,8 @@ def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
 def heading_range(track: Track, horizon_m: float) -> Floats:
     """Return the range of the headings [rad] from each state (n,) over one horizon, accurate to a cell of path."""
     size = horizon_m / CELLS_A_HORIZON
-    # A step longer than a horizon counts as slightly more than one horizon, so that a damaged speed needs no more
-    # memory.
+    # A step that is longer than a horizon counts as slightly longer than one horizon, because a damaged speed would
+    # need too much memory.
     distance = track.distance
 
     def cells_of(part: Floats) -> Floats:
@@ -224,7 +233,7 @@ def heading_range(track: Track, horizon_m: float) -> Floats:
     steps = np.diff(cells_of(distance[first]), prepend=0.0)
     cell = np.cumsum(np.minimum(steps, CELLS_A_HORIZON + 1.0)).astype(np.int64)
     cells = np.arange(cell[-1] + CELLS_A_HORIZON + 1)
-    # In a cell without a state the heading is interpolated.
+    # The heading of a cell without a state is interpolated.
     highest, lowest = (
         sliding_window_view(np.interp(cells, cell, extreme.reduceat(track.heading, first)), CELLS_A_HORIZON + 1)
         for extreme in (np.maximum, np.minimum)

@@ -1,4 +1,4 @@
-"""Rows of poses that the robot's own localisation computed: a topic of the log, tested in the trials of the report."""
+"""Rows of topics with poses that the localisation on the robot computed, tested in the trials of a report."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from icrtool.records.text import distance_text
 from icrtool.records.topic_poses import TopicPoses
 
 PIECES = 8
-"""Number of parts of equal distance. The errors over the parts are compared with the error over the whole drive."""
+"""Number of parts of equal distance. The errors over these parts are compared with the error over the whole drive."""
 
 GROWTH_OF_RANDOM_WALK = math.sqrt(PIECES)
-"""Ratio of the error over the whole drive to the error over a part, for a position that drifts as a random walk. With a
-heading that drifts the ratio is larger; with a measured position it is about 1."""
+"""Ratio of the error over the whole drive to the error over a part, for a position that drifts as a random walk. If the
+heading drifts, the ratio is larger; if the position is measured, the ratio is about 1."""
 
 FEWEST_COMPARED, MOST_COMPARED = 200, 4000
 """Smallest and largest number of states in which a topic is compared with the reference over the whole drive."""
@@ -42,8 +42,8 @@ class Departure(NamedTuple):
 
     Attributes
     ----------
-    whole_m : over the whole drive
-    piece_m : over `PIECES` parts of it, each with a turn, scale and shift of its own
+    whole_m : distance over the whole drive
+    piece_m : distance over `PIECES` parts of the drive, each with its own turn, scale and shift
     log_std : standard deviation of the logarithm of `piece_m`
     """
 
@@ -53,7 +53,7 @@ class Departure(NamedTuple):
 
     @property
     def grows(self) -> bool | None:
-        """Whether the error grows with distance, by two standard deviations; None where the data do not decide."""
+        """Whether the error grows with distance, by two standard deviations; None if the data do not decide."""
         if not (self.whole_m > 0.0 and self.piece_m > 0.0):
             return None
         log_ratio, drifting = math.log(self.whole_m / self.piece_m), math.log(GROWTH_OF_RANDOM_WALK)
@@ -63,16 +63,17 @@ class Departure(NamedTuple):
 
 
 def topic_rows(run: Run, track: Track, scored: Iterable[TopicPoses]) -> tuple[list[ComparedRow], list[Note]]:
-    """Return the row of each topic, and findings about them.
+    """Return the row of each topic, and findings about the topics.
 
     Parameters
     ----------
     track : track of the run's states
+    scored : poses of the topics
 
     Raises
     ------
     ConfigError
-        A topic is the run's reference, or has no pose while the run lasts.
+        A topic is the reference of the run, or has no pose within the run.
     """
     rows, notes = list[ComparedRow](), list[Note]()
     streams = {stream.role: stream for stream in run.document.streams}
@@ -98,7 +99,7 @@ def topic_rows(run: Run, track: Track, scored: Iterable[TopicPoses]) -> tuple[li
             over_all = f"{departs.whole_m:.2g} m over {distance_text(driven)}"
             why = f"its error does not grow with distance: {within}, {over_all}"
             meaning = "GNSS or a map is in it, or its drift is below the noise of the reference"
-            advice = "its row does not show how far it goes without GNSS; record a drive in which it has none"
+            advice = "its row does not show its drift without GNSS; record a drive in which it has no GNSS"
             notes.append(note("topic_not_open_loop", f"{name}: {why}: {meaning}; {advice}"))
         errors_of, path = partial(_errors, poses, t, track), partial(_path, poses, t, track)
         rows.append(ComparedRow(name, errors_of, path, knows))
@@ -106,14 +107,15 @@ def topic_rows(run: Run, track: Track, scored: Iterable[TopicPoses]) -> tuple[li
 
 
 def _errors(poses: TopicPoses, t: Floats, track: Track, trials: Trials) -> TrialErrors:
-    """Return the errors (k, h) of a topic's displacement and turn, position and heading aligned at each start.
+    """Return the errors (k, h) of a topic in trials; its pose is aligned with the reference at each start.
 
-    A trial needs poses along its whole path. Before the first pose, after the last one and across a gap there is none.
+    A trial needs poses along its whole path: it must not begin before the first pose, end after the last one, or cross
+    a gap.
 
     Notes
     -----
-    The errors are the translation part of the relative pose error of Sturm et al. (2012), and the angle of its rotation
-    part.
+    The position error is the translation part of the relative pose error (Sturm et al. 2012), the heading error the
+    angle of its rotation part.
     """
     errors = TrialErrors.none(trials.ends.shape)
     for h in range(trials.ends.shape[1]):
@@ -129,7 +131,7 @@ def _errors(poses: TopicPoses, t: Floats, track: Track, trials: Trials) -> Trial
 
 
 def _path(poses: TopicPoses, t: Floats, track: Track, start: int, end: int) -> OpenLoopPath | None:
-    """Return a topic's path from one state to another, aligned at the first; None across a gap."""
+    """Return the path of a topic between two states, aligned with the reference at the first; None across a gap."""
     at = track.t[start : end + 1]
     if not poses.covered(t, at[:1], at[-1:]).all():
         return None
@@ -140,13 +142,13 @@ def _path(poses: TopicPoses, t: Floats, track: Track, start: int, end: int) -> O
 
 
 def departure_of(poses: TopicPoses, t: Floats, track: Track, covered: np.ndarray) -> Departure | None:
-    """Return how far a topic departs from the reference; None where it covers too little of the drive."""
+    """Return the departure of a topic from the reference; None if the topic covers too little of the drive."""
     rows = _compared_rows(track, covered)
     return _departure(poses.at(t, track.t[rows])[0], track.place[rows], track.distance[rows])
 
 
 def _wheels_depart(run: Run, track: Track, covered: np.ndarray) -> bool:
-    """Return whether the error of the wheels' path grows over the drive, so that the reference shows such errors."""
+    """Return whether the error of the wheels' path grows over the drive: then the reference can show such errors."""
     path = drive_wheels(run.table, run.in_gap, odometry_icrs(run.table, None)["icr"])
     rows = _compared_rows(track, covered)
     departure = _departure(path.north_m[rows] + 1j * path.east_m[rows], track.place[rows], track.distance[rows])
@@ -154,7 +156,7 @@ def _wheels_depart(run: Run, track: Track, covered: np.ndarray) -> bool:
 
 
 def _compared_rows(track: Track, covered: np.ndarray) -> Ints:
-    """Return states at equal steps of distance at which a topic has poses and the reference is usable."""
+    """Return the states at equal steps of distance at which a topic has poses and the reference can be used."""
     rows = rows_at_steps(track.distance, max(float(track.distance[-1]) / MOST_COMPARED, 1e-6))
     return np.asarray(rows[covered[rows] & ~track.in_outage[rows]])
 

@@ -1,4 +1,4 @@
-"""GPS-dropout analysis: open loop from recorded states, over every horizon (Pentzer 2014, Section 6.4)."""
+"""Errors of open-loop trials from recorded states over every horizon (Pentzer 2014, Section 6.4)."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ from icrtool.records.stages import Watch, unwatched
 from icrtool.records.text import counted
 
 LARGEST_TABLE_BYTES = 96 << 20
-"""Largest memory of the errors and trial ends that are held at the same time [bytes]. Horizons are computed in groups
-that need less; a group has at least one horizon."""
+"""Largest memory of the errors and ends of trials that are held at the same time [bytes]. Horizons are computed in
+groups that need less memory; a group has at least one horizon."""
 
 BYTES_A_TRIAL = 12
 """Memory of one trial [bytes]: its error and the state at which it ends."""
@@ -52,10 +52,10 @@ BULK_IN_P95 = 3.0
 """Range of the first 50 bins of a histogram, as a multiple of p95."""
 
 MOST_BULKS = 10.0
-"""Largest ratio of the largest error to the range of the first 50 bins. It limits a histogram to some 500 bins."""
+"""Largest ratio of the largest error to the range of the first 50 bins. It limits a histogram to about 500 bins."""
 
 SHORTEST_HORIZON_M = 1e-3
-"""Shortest horizon [m]. It is below the accuracy of a state."""
+"""Shortest horizon [m]. It is shorter than the accuracy of a state."""
 
 STARTS_AT_ONCE = 1 << 14
 """Number of starts that a thread computes at a time."""
@@ -65,7 +65,8 @@ TRIAL_THREADS = 2
 
 
 ErrorSink = Callable[[str, Floats, Floats], None]
-"""Called with a model's name, horizons (h,) [m] and errors (n, h) [m], NaN where there is no trial."""
+"""Function that receives the name of a model, horizons (h,) [m] and errors (n, h) [m], NaN for a start without a
+trial."""
 
 
 def measure_errors(
@@ -85,10 +86,11 @@ def measure_errors(
 
     Parameters
     ----------
-    further : additional models whose numbers do not come from the filter
-    starts_of_further : start states for `further` and for all heading errors; closer starts give nearly equal trials
-    track : `icrtool.records.run.track_of` the run, where it exists already, because it is large for a long log
-    watch : called before each row
+    further : further rows, whose numbers do not come from the filter
+    starts_of_further : starts of the trials of `further` and of all heading errors; default: some of all starts,
+        because closer starts give nearly equal trials
+    track : result of `icrtool.records.run.track_of` for the run, which is large for a long log; default: it is computed
+    watch : called with the name of each row before it is computed
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {counted(len(run.table), 'state')}", "at least two are needed")
@@ -106,7 +108,7 @@ def measure_errors(
     before, after = list[documents.ErrorRow](), list[documents.ErrorRow]()
     at_once = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
     with ThreadPoolExecutor(TRIAL_THREADS) as pool:
-        # One after the other: all columns of a long log together would fill the memory.
+        # For a long log, horizons are computed one after the other, because all columns together would fill the memory.
         each = pool.map if at_once > TRIAL_THREADS else map
         for columns in [slice(begin, begin + at_once) for begin in range(0, len(horizons), at_once)]:
             group, ends = horizons[columns], counted_ends(track, horizons[columns], starts).T
@@ -129,7 +131,7 @@ def measure_errors(
                     after += each(_row, group.tolist(), errors[len(errors) if learned is None else learned :].T)
                 if sink is not None:
                     sink(model.name, group, errors)
-                del errors  # frees memory before the next model
+                del errors  # The memory is freed before the next model.
             counts.append(count_trials(ends.T))
             drawn.append(drawn_trials(group, ends))
     return OpenLoopErrors(
@@ -145,13 +147,13 @@ def measure_errors(
 
 
 def _sparse_starts(standing: Bools) -> Ints:
-    """Return at most about `MOST_TRIALS` of the states in which the robot drives."""
+    """Return about `MOST_TRIALS` evenly spaced states, or fewer, in which the robot drives."""
     driving = np.flatnonzero(~standing)
     return driving[:: max(len(driving) // MOST_TRIALS, 1)].copy()
 
 
 def _at_all_starts(errors: Floats, starts: Ints, states: int) -> Floats:
-    """Return the errors (k, h) of some starts in rows of all states (n, h); NaN in the other rows."""
+    """Return the errors (k, h) of starts (k,) as an array (n, h) of all states; NaN in the other rows."""
     whole = np.full((states, errors.shape[1]), np.nan)
     whole[starts] = errors
     return whole
@@ -160,7 +162,7 @@ def _at_all_starts(errors: Floats, starts: Ints, states: int) -> Floats:
 def _by_learning(
     run: Run, learned: int | None, before: list[documents.ErrorRow], after: list[documents.ErrorRow]
 ) -> documents.LearnedDocument | None:
-    """Return the errors of trials before and after the state in which the ICRs were learned; None without row icr."""
+    """Return the errors of trials before and after the state at which the ICRs were learned; None without row icr."""
     if not before:
         return None
     at_s, driven_m = (
@@ -170,13 +172,14 @@ def _by_learning(
 
 
 class _StartedTrials(NamedTuple):
-    """The trials at some horizons (h,), by the states (n,) at which they start.
+    """The trials of some horizons (h,), by the states (n,) at which they start.
 
     Attributes
     ----------
-    path_m : (n,) distance driven
-    blocks : blocks of path of each horizon; None where there are too few
-    slipping : (n,) of each horizon: whether a trial touches a slip event; None in a drive without slip events
+    path_m : (n,) distance driven until each state [m]
+    blocks : blocks of path of each horizon; None for a horizon without trials
+    slipping : for each horizon, whether the trial from each state touches a slip event (n,); None in a drive without
+        slip events
     """
 
     path_m: Floats
@@ -185,12 +188,12 @@ class _StartedTrials(NamedTuple):
 
     @classmethod
     def of(cls, run: Run, track: Track, horizons_m: Floats, ends: Rows) -> _StartedTrials:
-        """Return the trials that start at all states; `ends` (h, n) are the states at which they end."""
+        """Return the trials from all states; `ends` (h, n) has the states at which they end."""
         blocks = _blocks(track.distance, horizons_m, (column >= 0 for column in ends))
         return cls(track.distance, blocks, _slipping_trials(run, ends))
 
     def at(self, starts: Ints, horizons_m: Floats, errors: Floats) -> _StartedTrials:
-        """Return the trials at some starts (k,), which have errors (k, h)."""
+        """Return the trials from starts (k,), which have errors (k, h)."""
         path_m = self.path_m[starts]
         slipping = [None if touches is None else touches[starts] for touches in self.slipping]
         return _StartedTrials(path_m, _blocks(path_m, horizons_m, np.isfinite(errors.T)), slipping)
@@ -200,12 +203,13 @@ def _statistics(
     model: Model | ComparedRow, horizons_m: Floats, errors: Floats, of_few: TrialErrors, columns: slice,
     trials: _StartedTrials, each: Callable[..., Iterable[_AtHorizon]],
 ) -> Iterable[_AtHorizon]:  # fmt: skip
-    """Return the statistics of a model's errors (n, h) at some horizons.
+    """Return the statistics of a model's errors (n, h) at each horizon.
 
     Parameters
     ----------
-    of_few : errors of its turns and errors with aligned start headings, at all horizons
-    columns : of `of_few`, the horizons of `errors`
+    of_few : errors of the turns, and errors with aligned start headings, in fewer trials at all horizons
+    columns : columns of `of_few` with the horizons of `errors`
+    trials : the trials
     each : applies a function to each horizon, as `map` does
     """
     turned, aligned = of_few.heading.T[columns], of_few.aligned.T[columns]
@@ -214,10 +218,10 @@ def _statistics(
 
 
 def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], trials: Trials) -> list[TrialErrors]:
-    """Return the errors (k, h) in some trials by model; for the filter's models only heading errors.
+    """Return the errors (k, h) of each model in some trials; the filter's models have only heading errors.
 
-    All horizons are computed at once, so that a model drives the log only once. This is done before the tables of all
-    starts need memory.
+    All horizons are computed at once, so that a model drives the log only once. The errors are computed before the
+    tables of all starts need memory.
     """
     none = np.empty((0, trials.ends.shape[1]))
     return [
@@ -229,7 +233,7 @@ def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], tria
 
 
 class _AtHorizon(NamedTuple):
-    """The errors of one model at one horizon; `free`: errors of the trials that touch no slip event."""
+    """Statistics of the errors of one model at one horizon; `free` is of the trials that touch no slip event."""
 
     row: documents.SummaryRow
     bins: statistics.Histogram
@@ -239,7 +243,7 @@ class _AtHorizon(NamedTuple):
 
 
 def _slipping_trials(run: Run, ends: Rows) -> list[Bools | None]:
-    """Return which trials (n,) of each horizon touch a slip event, by their ends (h, n); None where there is none."""
+    """Return which trials (n,) of each horizon touch a slip event, by their ends (h, n); None without slip events."""
     if not run.sensors.events:
         return [None] * len(ends)
     before: Ints = np.cumsum(run.slipping) - run.slipping
@@ -247,7 +251,7 @@ def _slipping_trials(run: Run, ends: Rows) -> list[Bools | None]:
 
 
 def _turn_errors(track: Track, icrs: FrozenIcrs, trials: Trials) -> Floats:
-    """Return the errors (k, h) [rad] of the turns that ICRs make, NaN where there is no trial."""
+    """Return the errors (k, h) [rad] of the turns that ICRs give; NaN for a start without a trial."""
     turn = np.zeros(len(track.held) + 1)
     np.subtract(track.v_left, track.v_right, out=turn[1:])
     turn[1:] *= track.held
@@ -261,17 +265,18 @@ def _turn_errors(track: Track, icrs: FrozenIcrs, trials: Trials) -> Floats:
 
 
 def errors_from_states(run: Run, horizon_m: float) -> dict[str, Floats]:
-    """Return the open-loop error of each of the filter's models, from every recorded state.
+    """Return the open-loop error of each of the filter's models from every recorded state.
 
     Parameters
     ----------
-    run : of `icrtool.fit` or `icrtool.open_run`
+    run : result of `icrtool.fit` or `icrtool.open_run`
     horizon_m : distance without GNSS
 
     Returns
     -------
     dict
-        By model name, float64 (n,) [m]; NaN where there is no trial (`dropout` lists the reasons).
+        Errors, float64 (n,) [m], by the name of the model; NaN for a start without a trial (`dropout` lists the
+        reasons).
     """
     track = track_of(run)
     ends = trial_ends(track, np.array([horizon_m]))
@@ -284,11 +289,11 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
     Raises
     ------
     ConfigError
-        One is not a positive number, or there is none.
+        A horizon is not a positive number, or none is given.
     """
     horizons = np.unique(np.fromiter(horizons_m, np.float64))
     if not len(horizons):
-        raise ConfigError("horizons", "none is given", "name at least one distance in metres")
+        raise ConfigError("horizons", "no distance is given", "name at least one in metres")
     for horizon in horizons:
         if not (math.isfinite(horizon) and horizon >= SHORTEST_HORIZON_M):
             raise ConfigError("horizons", f"{horizon:g} m is no distance", f"give {SHORTEST_HORIZON_M:g} m or more")
@@ -296,13 +301,13 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
 
 
 def _row(metres: float, errors: Floats) -> documents.ErrorRow:
-    """Return the statistics of the errors (n,) [m] at one horizon."""
+    """Return the statistics of errors (n,) [m] at one horizon [m]."""
     trials, *numbers = statistics.RankedTrials.of(errors).summary()
     return documents.ErrorRow(metres, trials, *map(finite_or_none, numbers))
 
 
 def _blocks(path_m: Floats, horizons: Floats, tried: Iterable[Bools]) -> list[statistics.Blocks | None]:
-    """Return the blocks of path of each horizon; `tried` (n,) of each marks the starts with a trial."""
+    """Return the blocks of path of each horizon; `tried` has for each horizon the starts (n,) with a trial."""
     return [
         statistics.cut_blocks(has_trial, path_m, metres)
         for has_trial, metres in zip(tried, horizons.tolist(), strict=True)
@@ -310,7 +315,7 @@ def _blocks(path_m: Floats, horizons: Floats, tried: Iterable[Bools]) -> list[st
 
 
 def _errors(track: Track, model: Model, ends: Rows, pool: Executor) -> Floats:
-    """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
+    """Return the errors (n, h) [m] of a model from all starts, each horizon contiguous; NaN without a trial."""
     states, errors = ends.shape[1], np.empty(ends.shape)
 
     def fill(lo: int) -> None:
@@ -328,18 +333,20 @@ def _at_horizon(
 
     Parameters
     ----------
-    spread : how errors differ between drives, from other drives
-    errors : (n,) [m]; turned : (k,) errors of its turns [rad]
-    aligned : (n,) errors with aligned start headings [m], empty for the filter's models
+    spread : spread of the errors between drives, from other drives
+    metres : the horizon [m]
+    errors : (n,) [m]; turned : (k,) errors of the turns [rad]
+    aligned : (n,) errors with aligned start headings [m]; empty for the filter's models
+    blocks : blocks of path of the trials
     slipping : (n,) whether a trial touches a slip event
     """
     ranked = statistics.RankedTrials.of(errors)
     trials, expected, p50, p95, largest = ranked.summary()
-    # The bins show most trials in detail in spite of outliers; there are at most some hundred bins.
+    # The width of the bins shows most trials in detail in spite of outliers, with at most some hundred bins.
     shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
     bins = ranked.histogram(statistics.round_bin_width(shown_m))
     sums = statistics.block_sums(errors, blocks, ranked, p50, p95)
-    del ranked  # frees a column of the log before the intervals need a column of the same size
+    del ranked  # A column of the log is freed before the intervals need a column of the same size.
     intervals = statistics.error_intervals(errors, blocks, sums, p50, p95, spread)
     _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.of(np.degrees(turned)).summary()
     shares = 100.0 * expected / metres, 100.0 * p95 / metres
@@ -350,7 +357,7 @@ def _at_horizon(
 
 
 def _aligned(errors: Floats, blocks: statistics.Blocks | None) -> documents.AlignedErrors | None:
-    """Return the statistics of errors (n,) [m] with aligned start headings; None where there are none."""
+    """Return the statistics of errors (n,) [m] with aligned start headings; None without such errors."""
     if not np.isfinite(errors).any():
         return None
     ranked = statistics.RankedTrials.of(errors)
@@ -359,7 +366,7 @@ def _aligned(errors: Floats, blocks: statistics.Blocks | None) -> documents.Alig
 
 
 def _result(model: Model | ComparedRow, by_horizon: Iterable[_AtHorizon]) -> documents.ModelResult:
-    """Return the result of one model from its statistics at each horizon."""
+    """Return the result of a model from its statistics at each horizon."""
     rows, bins, sums, free, aligned = zip(*by_horizon, strict=True)
     blocks = []
     for row, sums_of_row in zip(rows, sums, strict=True):

@@ -1,4 +1,4 @@
-"""Convergence times of the ICRs of a run: from the estimates (Pentzer 2014, Section 5.2), or from their deviations."""
+"""Convergence times of the ICRs of a run, from their estimates (Pentzer 2014, Section 5.2) or standard deviations."""
 
 from __future__ import annotations
 
@@ -10,35 +10,41 @@ from icrtool.records.run_document import IcrColumn
 from icrtool.records.tables import States
 
 ARRIVED_S = 2.0
-"""Time for which an estimate must stay within 10 % of its final change to have converged [s]. An overshoot crosses this
-range faster."""
+"""Time for which a converged estimate must stay within 10 % of its final change [s]. An overshoot crosses this range
+faster."""
 
 SMALLEST_CHANGE_M = 0.03
-"""Smallest change of an estimate that shows its convergence [m]. Below it the standard deviation shows it."""
+"""Smallest change of an estimate that shows its convergence [m]. A smaller change is replaced by the standard
+deviation."""
 
 LEARNED_SHARE = 0.9
-"""Share of the decrease of a standard deviation after which the ICR is learned."""
+"""Share of the decrease of its standard deviation after which an ICR is learned."""
 
 LEAST_FALL = 0.5
-"""Smallest relative decrease of a standard deviation. With less the drive added nothing to the start."""
+"""Smallest relative decrease of a standard deviation. With a smaller decrease, the drive added nothing to the start."""
 
 
 def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:
-    """Return when each ICR estimate converged; `until_s` : the end of the states that are used.
+    """Return when each ICR estimate converged.
+
+    Parameters
+    ----------
+    table : the recorded states
+    until_s : end of the used states, since the first state; None: all are used
 
     Returns
     -------
     dict
         By column: time [s] at which the estimate has made 10 % of the change from its start to its settled value
-        (median over the second half of the run), and time from which on it stays within 10 % of that change for
-        `ARRIVED_S`; None where it never settles. For an estimate that starts near its settled value (10 % of the change
-        is less than its settled standard deviation), the times at which its standard deviation has made 10 % and 90 %
-        of its decrease; None if it decreases by less than half.
+        (median over the second half of the run), and time from which it stays within 10 % of this change for
+        `ARRIVED_S`; None if it never settles. For an estimate that starts near its settled value (10 % of the change is
+        less than its settled standard deviation): the times at which its standard deviation has made 10 % and 90 % of
+        its decrease; None if it decreases by less than half.
 
     Notes
     -----
-    Pentzer 2014, Section 5.2: the time from 10 % change to within 90 % of the final value. An estimate that happens to
-    start at its final value has no such time, though the filter did not know that it was right.
+    Pentzer 2014, Section 5.2: the time from 10 % of the change until within 90 % of the final value. An estimate that
+    happens to start at its final value has no such time, although the filter did not know that it was right.
     """
     rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
     t_s = table.t_s[:rows]
@@ -49,7 +55,7 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
 
 
 def _span(t_s: Floats, estimate: Floats, std: Floats) -> tuple[float, float] | None:
-    """Return begin and end [s] of the convergence of one estimate (n,) with its standard deviation (n,)."""
+    """Return begin and end [s] of the convergence of an estimate (n,) and its standard deviation (n,); see `converge`."""
     settled, noise = (float(np.median(column[len(column) // 2 :])) for column in (estimate, std))
     change = settled - float(estimate[0])
     if abs(change) < max(SMALLEST_CHANGE_M, noise / (1.0 - LEARNED_SHARE)):
@@ -64,13 +70,14 @@ def _span(t_s: Floats, estimate: Floats, std: Floats) -> tuple[float, float] | N
 
 
 def fallen_at(std: Floats, share: float = LEARNED_SHARE) -> int | None:
-    """Return the first state at which a standard deviation (n,) has made a share of its decrease; None without one.
+    """Return the first state at which a standard deviation (n,) has made a share of its decrease.
+
+    None if it decreases by less than `LEAST_FALL`.
 
     Notes
     -----
     The standard deviation decreases from s_0 at the first state to s_f, its median over the second half of the states.
-    It has made the share at the first state with s <= s_f + (1 - share) (s_0 - s_f). None where s_f exceeds half of s_0
-    (`LEAST_FALL`).
+    It has made the share at the first state with s <= s_f + (1 - share) (s_0 - s_f).
     """
     first, final = float(std[0]), float(np.median(std[len(std) // 2 :]))
     if final > (1.0 - LEAST_FALL) * first:
@@ -81,7 +88,7 @@ def fallen_at(std: Floats, share: float = LEARNED_SHARE) -> int | None:
 def icr_std_m(run: Run, column: IcrColumn) -> Floats:
     """Return the standard deviation (n,) of an ICR [m] at each recorded state; the last is ``final_std`` of run.json.
 
-    It is the filter's own (states.csv) where the drive does not show the ICR.
+    If the drive does not show the ICR, the filter's standard deviation (states.csv) is returned.
 
     Notes
     -----
@@ -89,8 +96,8 @@ def icr_std_m(run: Run, column: IcrColumn) -> Floats:
     of the drive (`icrtool.estimation.observability.final_covariance`). With the filter's variance P(t), the information
     that it has gained since the start is 1/P(t) - 1/P(0). This information is multiplied by one factor, so that the
     last value is ``final_std``. The start stays as configured, and the part of the clocks in x is added. Where the
-    filter knows no more at the end than at the start (a warm start), the difference of the variances, or their ratio,
-    is applied instead.
+    filter knows no more at the end than at the start (a warm start), the difference or the ratio of the variances is
+    applied instead.
     """
     filter_std: Floats = np.asarray(getattr(run.table, f"std_{column}"), np.float64)
     final = run.document.icr.final_std[column]
@@ -101,7 +108,7 @@ def icr_std_m(run: Run, column: IcrColumn) -> Floats:
     if 0.0 < end < first and variance[-1] < first:
         gained = 1.0 / variance - 1.0 / first
         factor = (1.0 / end - 1.0 / first) / gained[-1]
-        # Where the filter knows less than at the start (after a change of ground), its own variance holds.
+        # After a change of ground the filter may know less than at the start. Its own variance is then used.
         counted = 1.0 / (1.0 / first + np.where(gained > 0.0, factor * gained, min(factor, 1.0) * gained))
     elif end >= variance[-1]:
         counted = variance + (end - variance[-1])

@@ -209,7 +209,7 @@ def test_requests_that_cannot_be_met_leave_the_old_report(
 def test_the_smoother_may_be_the_reference(folder: Path, report_here) -> None:
     status, _, err = report_here(folder, RUN, "--reference", "smoothed")
     assert status == 1
-    assert "it has no smoothed states; run icrtool fit --smooth" in err
+    assert "has no smoothed states; run icrtool fit --smooth" in err
     status, out, _ = report_here(folder, LOG, *ROBOT, "--reference", "smoothed", *LEAN, "-v")
     assert status == 0
     assert "compared with the smoothed trajectory" in " ".join(out.split())
