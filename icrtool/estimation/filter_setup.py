@@ -1,4 +1,4 @@
-"""From aligned sensors and a configuration to the arguments of the kernel: times, noises, the start."""
+"""Arguments of the filter kernel from aligned sensors and a configuration: times, noises, start."""
 
 from __future__ import annotations
 
@@ -17,74 +17,75 @@ from icrtool.records.presets import FIELD, ProcessNoise
 from icrtool.records.run import WarmStart, width_or_usual_m
 
 USUAL_FACTOR = 1.5
-"""y right and -y left of a robot of which nothing is known, in parts of b/2; x is 0.
+"""y right and -y left at the start of a robot of which nothing is known, in half track widths b/2; x is 0.
 
 Published skid factors are 1.125 to 1.875 (Clearpath A200, J100, W200, A300, Husarion WH01, WH05), the robots of Pentzer
 2014 have 1.58 and 2.28.
 """
 
 USUAL_FACTOR_STD = 1.0
-"""Standard deviation of each ICR at the start of a robot of which nothing is known, in parts of b/2.
+"""Standard deviation of each ICR at the start of a robot of which nothing is known, in half track widths b/2.
 
-All robots that were seen lie within it or little beyond: 1.0 (wheels that roll) to 2.7 (a rigid-body simulation on a
-circle). The published factors alone spread by 0.36 about 1.5. With 0.4 in place of 1.0, expected errors after 10 m
-with momentary ICRs are 1.08 times as large on 25 logs (geometric mean), 2.4 times on the circle: the filter learns a
-robot far from the usual ones more slowly.
-"""
+The ICRs of all observed robots are 1.0 (wheels that roll) to 2.7 (a rigid-body simulation on a circle). The published
+factors alone have a standard deviation of 0.36 about 1.5. With 0.4 instead of 1.0, expected errors after 10 m with
+momentary ICRs are 1.08 times as large on 25 logs (geometric mean) and 2.4 times on the circle, because the filter
+learns an unusual robot more slowly."""
 
 SKID_FACTOR_STD = 0.4
-"""Standard deviation of y right and y left at the start of a robot of published skid factor, in parts of b/2.
+"""Standard deviation of y right and y left at the start of a robot with a published skid factor, in half track widths.
 
-On five recorded Warthog logs and one of a Husky the y ICRs differ from their published factors by 0.13 (rms), from one
-ground to another by 0.1; other grounds may differ more. The factor states nothing of x.
+On five recorded Warthog logs and one Husky log, the y ICRs differ from their published factors by 0.13 (rms), and
+between grounds by 0.1; other grounds may differ more. The factor does not state x.
 """
 
 LEAST_START_STD_M = 0.3
-"""Standard deviation of each ICR at the start of robots narrower than 0.6 m [m].
+"""Smallest standard deviation of an ICR at the start [m]. It applies to robots that are narrower than 0.6 m.
 
-A track width configured too small would hold the filter back: if 0.15 m is configured for 0.8 m, the y ICRs end 0.03 m
-too near to 0, and without this limit 0.11 m. It costs robots of 0.2 m nothing.
+If the configured track width is too small, a small standard deviation would keep the ICRs near the start: with 0.15 m
+configured for 0.8 m, the y ICRs end 0.03 m too near to 0, and without this limit 0.11 m. The errors of robots of 0.2 m
+do not change.
 """
 
 FARTHEST_START_M, LARGEST_START_STD_M = 1000.0, 10_000.0
-"""Largest distance of an ICR and largest standard deviation in a warm start [m], as for a configured start."""
+"""Largest distance of an ICR from the origin, and largest standard deviation, in a warm start [m]."""
 
 GAP_MOVE_STD, GAP_TURN_STD = 2.0, 1.0
-"""Standard deviation of the position [m/√s] and of the heading [rad/√s] in a gap in the wheel data: both variances grow
-in proportion to time."""
+"""Random walks of the position [m/√s] and of the heading [rad/√s] in a gap in the wheel data."""
 
 WHEEL_GAP_IN_INTERVALS = 2.5
-"""Smallest ratio of a gap to the usual interval between wheel samples, for slow streams."""
+"""Smallest length of a gap in the wheel data, in usual intervals between samples. It matters for slow streams."""
 
 LEAST_ICR_IN_HALF_WIDTHS = 0.2
-"""Smallest distance of a y ICR from the centre line, in half track widths. ICRs lie outside the tracks (Pentzer 2014,
-Section 2), but an antenna off centre may shift them."""
+"""Smallest distance of a y ICR from the centre line, in half track widths. ICRs lie outside of the tracks (Pentzer
+2014, Section 2), but an antenna off the centre line shifts them."""
 
 EVENT_MARGIN_S = 0.2
-"""Time by which slip events are extended on both sides [s], because begin and end are uncertain by this time."""
+"""Time by which slip events are extended on both sides [s], because their begins and ends are uncertain by this
+time."""
 
 RECOVERY_COUNT, RECOVERY_S = 10, 1.0
-"""Number of rejected measurements, and time [s] between the first and the last one, that must agree with each other
-before measurements are accepted again."""
+"""Smallest number of rejected measurements that agree with each other, and smallest time between the first and the last
+of them [s], after which measurements are accepted again."""
 
 TURN_WANDER_RAD = math.radians(1.2)
-"""Random walk of the difference between a body's turn and its wheels' turn [rad/sqrt(s)]. Errors of an attitude sensor
-hide it, but with estimated headings of 0.1 deg the ICRs would follow it."""
+"""Random walk of the difference between the turn of a body and of its wheels [rad/√s]. The errors of an attitude sensor
+are larger, but with estimated headings of 0.1 deg the ICRs would follow this difference."""
 
 CHANGE_S = 0.5
 """Duration of a change of the turn rate [s]."""
 
 MEMORY_S = 0.5
 """Time over which estimated headings of 0.1 deg are averaged [s]. Otherwise the ICRs would be learned from the shortest
-turns. In these, tracked robots turn by 2 % more than over some metres, and encoders with few counts show no turn."""
+turns, in which tracked robots turn by 2 % more than over some metres, and encoders with few counts show no turn."""
 
 
 class FilterSetup(NamedTuple):
-    """One run, ready for the kernels: the arguments of `run_ekf` and `run_smoother`.
+    """Arguments of `run_ekf` and `run_smoother` for one run.
 
     Attributes
     ----------
-    t0 : time of the start [s]; x0 (6,), P0 (6, 6) : state and covariance there
+    data, parameters : inputs and constants of the filter
+    t0 : time of the start [s]; x0 (6,), P0 (6, 6) : state and covariance at the start
     """
 
     data: FilterInputs
@@ -95,12 +96,12 @@ class FilterSetup(NamedTuple):
 
 
 def check_start(config: Config) -> None:
-    """Raise where configured initial ICRs are on the wrong side, if the preset keeps the sides.
+    """Refuse configured initial ICRs on the wrong side, if the preset keeps the ICRs on their sides.
 
     Raises
     ------
     ConfigError
-        An ICR is on the wrong side; the key is named.
+        An ICR is on the wrong side; the error names its key.
     """
     settings = config.filter
     if not settings.rules.keeps_sides:
@@ -111,7 +112,7 @@ def check_start(config: Config) -> None:
             raise ConfigError(
                 f"filter.initial_y_icr_{side}_m",
                 "preset field keeps the right ICR right and the left one left (right > 0 > left)",
-                f"found {value:g}; preset paper starts anywhere",
+                f"found {value:g}; preset paper starts with any ICRs",
             )
 
 
@@ -130,16 +131,17 @@ def set_up_filter(
     Parameters
     ----------
     sensors : the aligned streams
-    noise : process noise of the pose, in place of the configured one
-    changes_s : terrain changes, seconds since the first recorded state; the ICR covariance is inflated there
+    config : the configuration
+    noise : process noise of the pose; default: configured
+    changes_s : terrain changes, seconds since the first recorded state, at which the ICR covariance is inflated
     warm_start : final ICRs of another run, in place of the configured start
-    outages_ns : half-open spans in which GNSS and heading are left out
-    start : ICRs that a run started from; default: `initial_icrs`
+    outages_ns : half-open spans in which fixes and headings are left out
+    start : ICRs at the start; default: `initial_icrs`
 
     Raises
     ------
     DataError
-        No wheel sample after the first fix and heading, or outages that leave no fix or no heading.
+        There is no wheel sample after the first fix and heading, or the outages leave no fix or no heading.
     """
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
     epoch = int(wheels.stamp_ns[0])
@@ -160,7 +162,7 @@ def set_up_filter(
         heading_z=headings.heading_rad[sample],
         heading_r=headings.var_rad2[sample],
         change_t=np.empty(0),
-        # A forced outage has no slip events, because these were found with the fixes in it.
+        # A forced outage has no slip events, because the events in it were found with its fixes.
         slipping=intervals_in(wheels.stamp_ns, events) & ~intervals_in(wheels.stamp_ns, outages_ns),
     )
     start = initial_icrs(config) if start is None else start
@@ -170,7 +172,7 @@ def set_up_filter(
     data = _without_lost_headings(data, config, sensors.facts.antenna_m)
     if not (len(gnss_t) and len(heading_t)):
         raise DataError(sensors.name, "the outages leave no fix or no heading", "shorten them")
-    # the first stamp by which wheel, GNSS and heading have each been seen
+    # The run starts when a wheel sample, a fix and a heading have been measured.
     t0 = max(float(wheel_t[0]), float(gnss_t[0]), float(heading_t[0]))
     if t0 >= wheel_t[-1]:
         why = "no wheel sample after the first fix and the first heading"
@@ -183,18 +185,18 @@ def set_up_filter(
 
 
 LOST_RAD = 0.5
-"""Standard deviation of a heading after a gap from which on it is lost [rad]: the filter is linear in the heading."""
+"""Standard deviation of a heading after a gap above which it is lost [rad]. The filter is linear in the heading."""
 
 LOST_FIX_VARIANCE_M2 = 100.0
-"""Variance of a fix of an antenna aside of the body origin while the heading is lost [m^2]. With its own variance such
-a fix would turn the heading."""
+"""Variance of a fix while the heading is lost, for an antenna away from the body origin [m^2]. With its own variance,
+such a fix would turn the heading."""
 
 
 def _without_lost_headings(data: FilterInputs, config: Config, antenna_m: tuple[float, float]) -> FilterInputs:
-    """Return the inputs with wheel samples marked that follow a gap in wheels and headings, until the next heading.
+    """Return the inputs in which wheel samples after a gap in wheels and headings are marked, until the next heading.
 
-    The filter does not dead-reckon through marked samples, as in a slip event. If the pose moved along an unknown
-    heading, the filter would get a wrong heading with a small standard deviation, and reject the measured headings.
+    The filter does not dead-reckon through marked samples, as in a slip event. Otherwise the pose would move along an
+    unknown heading: the filter would get a wrong heading with a small standard deviation, and reject measured headings.
     """
     if not config.filter.rules.corrects or len(data.wheel_t) < 2 or not len(data.heading_t):
         return data
@@ -207,7 +209,7 @@ def _without_lost_headings(data: FilterInputs, config: Config, antenna_m: tuple[
         if GAP_TURN_STD * math.sqrt(end - seen) <= LOST_RAD or after == len(data.heading_t):
             continue
         until = data.heading_t[after]
-        # a sample is held until the next one: the heading is unknown in all of these
+        # A sample holds until the next one, so the heading is unknown in all samples of the span.
         lost[row + 1 : np.searchsorted(data.wheel_t, until)] = True
         of_fixes |= (data.gnss_t > seen) & (data.gnss_t <= until)
     if not (lost.any() or of_fixes.any()):
@@ -226,7 +228,7 @@ def chi2_gate(probability: float, degrees: int) -> float:
 
 
 def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints | slice:
-    """Return the rows outside the outages; without outages a slice, to avoid a copy."""
+    """Return the rows of stamps outside of the outages; without outages a slice, to avoid a copy."""
     if not outages_ns:
         return slice(None)
     kept = np.ones(len(stamps_ns), np.bool_)
@@ -242,6 +244,7 @@ def _start_state(
     parameters: FilterParameters,
     warm_start: WarmStart | None,
 ) -> tuple[Floats, Floats]:
+    """Return state (6,) and covariance (6, 6) at the start `t0` [s]; `icrs`: initial ICRs and standard deviations."""
     fix = int(np.searchsorted(data.gnss_t, t0, side="right")) - 1
     sample = int(np.searchsorted(data.heading_t, t0, side="right")) - 1
     psi = math.remainder(float(data.heading_z[sample]), 2 * math.pi)
@@ -257,7 +260,7 @@ def _start_state(
 
 
 def _check_warm_start(start: WarmStart) -> None:
-    """Refuse ICRs and a covariance that cannot be the end of a run."""
+    """Refuse a warm start whose ICRs or covariance cannot be the result of a run."""
     icrs, covariance = np.asarray(start.icrs_m, np.float64), np.asarray(start.covariance_m2, np.float64)
     if icrs.shape != (3,) or not (np.abs(icrs) <= FARTHEST_START_M).all():
         values = ", ".join(f"{value:.4g}" for value in icrs.ravel()[:3])
@@ -268,12 +271,12 @@ def _check_warm_start(start: WarmStart) -> None:
 
 
 def initial_icrs(config: Config) -> IcrStart:
-    """Return the ICRs at the start and their standard deviations: configured, else from the preset.
+    """Return the ICRs at the start and their standard deviations, configured or else from the preset.
 
-    They do not depend on the log. In preset ``field`` they come from the robot's published skid factor where it has one
-    (`SKID_FACTOR_STD`), else from usual skid-steer robots (`USUAL_FACTOR`). In this preset a configured start inside
-    the tracks is moved out to the tracks, because close to W = 0 the filter would need very long to recover. The
-    standard deviation of a start far from the tracks equals its distance from them.
+    They do not depend on the log. In preset ``field`` they come from the robot's published skid factor if it has one
+    (`SKID_FACTOR_STD`), else from usual skid-steer robots (`USUAL_FACTOR`). In this preset, a configured start between
+    the tracks is moved to the tracks, because close to W = 0 the filter would recover very slowly. If a start is far
+    outside of the tracks, its standard deviation equals its distance from them.
     """
     settings, robot, half = config.filter, config.robot, width_or_usual_m(config.robot.track_width_m) / 2
     factor = None if robot.track_width_m is None else robot.skid_factor
@@ -295,12 +298,12 @@ def initial_icrs(config: Config) -> IcrStart:
 
 
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
-    """Return the interval between wheel samples [s] above which there is a gap: at least a few usual intervals."""
+    """Return the interval between wheel samples above which there is a gap [s]: configured, or some usual intervals."""
     return max(config.filter.wheel_gap_s, WHEEL_GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
 
 
 def configured_noise(config: Config) -> ProcessNoise:
-    """Return the process noise of the pose that a run starts with: as configured, else the preset's."""
+    """Return the process noise of the pose at the start of a run, configured or else from the preset."""
     settings = config.filter
     preset = settings.rules.process_noise
     position, heading = settings.process_position_mps, settings.process_heading_degps
@@ -317,15 +320,15 @@ def process_variance(config: Config, noise: ProcessNoise) -> tuple[float, float,
 
 
 def _samples_that_err_alike(sensors: SensorData, noise: ProcessNoise) -> float:
-    """Return 2 tau / interval, at least 1: the number of headings with as much information as one independent heading.
+    """Return the number of headings that have the information of one independent heading: 2 tau / interval, at least 1.
 
     Notes
     -----
     An error with correlation exp(-|t|/tau), sampled much faster than tau, averages over time T like T / (2 tau)
     independent samples. With precise headings of variance s^2 and correlation time tau, and process noise of density q,
     the filter's variance is sqrt(2 tau s^2 q). With tau = s^2 / (2 q) it equals s^2, the variance of the estimate. The
-    filter's memory is then sqrt(2 tau s^2 / q), at least `MEMORY_S` with the usual noise. All headings count, so that
-    an outage does not change the weights of the other headings.
+    filter's memory is then sqrt(2 tau s^2 / q), at least `MEMORY_S` with the usual noise. The interval is taken from
+    all headings, so that an outage does not change the weights of the other headings.
     """
     tau_s, stamps = sensors.facts.heading_correlation_s, sensors.headings.stamp_ns
     if sensors.facts.headings_are_precise:
@@ -342,10 +345,15 @@ def _samples_that_err_alike(sensors: SensorData, noise: ProcessNoise) -> float:
 def _response_variance(data: FilterInputs, width_m: float) -> Floats:
     """Return the growth of the heading's variance while the wheels change the turn rate (n,) [rad^2/s].
 
+    Parameters
+    ----------
+    width_m : separation of the ICRs
+
+    Notes
+    -----
     A body follows its wheels with a delay, or slips less at first. Each change of the turn rate therefore moves the
     heading by up to `RESPONSE_S` times this change. Within a change the errors of all steps have one sign, so white
     noise with the size of a single step's error would be too small, and most of the error would go into the ICRs.
-    `width_m` is the ICRs' separation.
     """
     t = data.wheel_t
     turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m
@@ -355,6 +363,7 @@ def _response_variance(data: FilterInputs, width_m: float) -> Floats:
 
 
 def _parameters(config: Config, data: FilterInputs, sensors: SensorData, noise: ProcessNoise) -> FilterParameters:
+    """Return the constants of the filter for a run."""
     settings, width_m = config.filter, width_or_usual_m(config.robot.track_width_m)
     rules = settings.rules
     gates = [chi2_gate(settings.gate_probability, degrees) if rules.gates else math.inf for degrees in (2, 1)]

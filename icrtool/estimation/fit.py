@@ -1,4 +1,4 @@
-"""Fit: learn the track ICRs of a robot from a log (Pentzer 2014, Sections 3, 6), and follow jumps of its reference."""
+"""Fit of a log: the track ICRs of a robot (Pentzer 2014, Sections 3, 6), and the jumps of its reference."""
 
 from __future__ import annotations
 
@@ -31,20 +31,21 @@ def fit_filter(
     warm_start: WarmStart | None = None,
     watch: Watch = unwatched,
 ) -> Run:
-    """Return the run of a log without its motion model: align the sensors, run the filter, summarise.
+    """Return the run of a log without its motion model: the sensors are aligned, filtered and summarised.
 
-    Parameters and errors are those of `icrtool.pipeline.fit_log`.
+    `icrtool.pipeline.fit_log` describes the parameters and the errors.
 
     Notes
     -----
-    The EKF of Pentzer 2014, Eqs. 13-25, event by event; ``filter.preset`` chooses between the paper's constants and
-    start (``paper``) and constants for field logs (``field``).
+    The EKF of Pentzer 2014, Eqs. 13-25, event by event. ``filter.preset`` chooses between constants and start of the
+    paper (``paper``) and constants for recorded logs (``field``).
     """
     watch("aligning")
     log = with_right_positions(choose_reference(log, config), config)
     measurements = align(log, config)
     inputs, datum, rejected = log.inputs, log.datum, log.rejected_fixes
-    # The log's columns that the filter does not use need half of the memory of the states.
+    # The columns of the log are freed, because the filter does not use them. They need half of the memory of the
+    # states.
     del log
     watch("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=request.changes_s)
@@ -70,13 +71,13 @@ def fit_filter(
 
 
 SAME_JUMP_NS = 10**9
-"""Time between two jumps below which they count as one [ns]. No trial fits between them."""
+"""Time between two jumps below which they count as one jump [ns]. No trial fits between them."""
 
 FOLLOWED_SIGMAS, FOLLOWS_WITHIN_S = 3.0, 5.0
-"""Distance to a fix, in standard deviations, at which the filter has followed it, and the longest time for it [s]."""
+"""Distance to a fix below which the filter follows it, in standard deviations, and longest time until then [s]."""
 
 BRIDGED = 0.25
-"""Ratio of the sum of steps to the largest step below which the steps cancel each other."""
+"""Ratio of the sum of steps to the largest step below which the steps cancel."""
 
 
 def followed_jumps(
@@ -86,36 +87,38 @@ def followed_jumps(
 
     Parameters
     ----------
-    sensors : with the jumps of fixes and headings
+    sensors : the streams, with the jumps of fixes and headings
     gnss, heading : outcome of fixes and headings in the filter
 
     Notes
     -----
-    A filter that rejects fixes continues with its wheels, and jumps when it follows the fixes again. If the fixes have
-    come back by then, it does not jump.
+    If the filter rejects fixes, it continues with the wheels, and jumps when it follows the fixes again. If the fixes
+    have jumped back by then, the filter does not jump.
     """
     used = gnss.stamp_ns[gnss.used], heading.stamp_ns[heading.used]
     noise = np.sqrt(sensors.fixes.var_north_m2 + sensors.fixes.var_east_m2)
     near = gnss.stamp_ns[gnss.used & (gnss.difference < FOLLOWED_SIGMAS * noise)]
 
     def followed(jump: ReferenceJump) -> ReferenceJump:
+        """Return a jump from the last used measurement before it to the first used measurement after it."""
         stamps = used[jump.kind == "heading"]
         before = int(np.searchsorted(stamps, jump.begin_ns, side="right")) - 1
         begin_ns = int(stamps[before]) if before >= 0 else jump.begin_ns
         return msgspec.structs.replace(jump, begin_ns=begin_ns, end_ns=_first_from(stamps, jump.end_ns))
 
     def settled(jump: ReferenceJump) -> ReferenceJump:
+        """Return a jump that ends when the filter is near the fixes again."""
         end = jump.end_ns if jump.kind == "heading" else _first_from(near, jump.end_ns)
         return msgspec.structs.replace(jump, end_ns=min(end, jump.end_ns + round(FOLLOWS_WITHIN_S * 1e9)))
 
-    # between the jumps of one rejection the filter does not follow the reference
+    # The filter does not follow the reference between the jumps of one rejection, so these jumps are joined.
     spans = [
         settled(jump)
         for jump in _joined([followed(jump) for jump in sensors.jumps], -1)
-        # steps that cancel each other are no jump
+        # Steps that cancel are not a jump.
         if jump.kind == "heading" or math.hypot(jump.moved_north_m, jump.moved_east_m) >= BRIDGED * jump.size_m
     ]
-    # a decided jump includes the undecided jumps around it
+    # A decided jump includes the undecided jumps near it.
     decided = _joined([jump for jump in spans if not jump.undecided], SAME_JUMP_NS)
     begins, free = [jump.begin_ns for jump in decided], []
     for jump in spans:
@@ -129,12 +132,13 @@ def followed_jumps(
 
 
 def _first_from(stamps: Ints, at: int) -> int:
+    """Return the first stamp at or after a time [ns]; the time itself if there is no such stamp."""
     row = int(np.searchsorted(stamps, at))
     return int(stamps[row]) if row < len(stamps) else at
 
 
 def _joined(jumps: list[ReferenceJump], near_ns: int) -> list[ReferenceJump]:
-    """Return jumps, each joined to the one before where it begins at most `near_ns` after its end."""
+    """Return jumps, of which those that begin at most `near_ns` after the end of the jump before are joined to it."""
     joined: list[ReferenceJump] = []
     for jump in sorted(jumps, key=attrgetter("begin_ns")):
         if not joined or jump.begin_ns > joined[-1].end_ns + near_ns:

@@ -1,4 +1,4 @@
-"""The information of a drive on its ICRs, the turns that it lacks, and the differences between its stretches."""
+"""Information of a drive about its ICRs, the turns that it lacks, and the differences between its stretches."""
 
 from __future__ import annotations
 
@@ -23,50 +23,51 @@ from icrtool.records.run_document import ExcitationDocument, Excited, NumberByIc
 from icrtool.records.tables import States
 
 STATE_WINDOW_M, WINDOW_IN_SEPARATIONS = 2.0, 3.0
-"""Distance of the wheels, with spins, over which displacement and turn are compared: the smaller of this distance [m]
-and this multiple of y right - y left. Slip is a share of the distance; over 2 m it hides the ICRs of a robot of 0.2
-m."""
+"""Distance of the wheels, spins included, over which displacement and turn are compared: the smaller of this distance
+[m] and this multiple of y right - y left. Slip is a share of the distance; over 2 m it exceeds the effect of the ICRs
+of a robot of 0.2 m."""
 
 STRETCH_IN_WINDOWS = 10.0
-"""Number of windows in a stretch. Errors within a stretch are correlated, since slip, ground and heading errors last
+"""Length of a stretch, in windows. Errors within a stretch are correlated, because slip, ground and heading errors last
 for some metres."""
 
 WIDTH_M = 1.0
-"""Track width of the terms here [m]. The ICRs do not depend on its value."""
+"""Track width of the motion model in this module [m]. The ICRs do not depend on its value."""
 
 HEADING_BIAS_RAD = math.radians(1.0)
 """Standard deviation of the heading's offset before a drive [rad]."""
 
 SCALE_ERROR = 0.02
-"""Standard deviation of the wheels' scale, and of the difference of the sides' scales, before a drive. A circle alone
-does not separate the ICRs from these scales and the heading's offset."""
+"""Standard deviation of the wheels' scale, and of the difference between the scales of the sides, before a drive. A
+circle alone does not separate the ICRs from these scales and the heading's offset."""
 
 Y_OF_STRETCH, X_OF_STRETCH = 0.04, 0.1
-"""Prior standard deviation of a stretch's ICRs from the drive's ICRs by ground and slip, as a share of y right - y
-left.
+"""Standard deviation of the y ICRs, and of x_icr, of a stretch about those of the drive before it is driven, as a share
+of y right - y left. Ground and slip differ between stretches.
 
 x_icr also changes with the speed of a turn: the prior of side slip, 0.1 s over a turn gain of 0.6
-(`icrtool.motion.models`), is 0.1 of 0.9 to 1.8 m at 0.5 to 1.1 m/s."""
+(`icrtool.motion.models`), gives 0.1 of 0.9 to 1.8 m at 0.5 to 1.1 m/s."""
 
 SLIPS = 0.4
-"""Excess of y right - y left over the track width, as a share of b, from which on a robot has the usual slip. With less
-slip, its variation is smaller in proportion."""
+"""Excess of y right - y left over the track width, as a share of b, above which slip varies as usual. With a smaller
+excess, the variation is smaller in proportion."""
 
 LEAST_SLIP = 0.25
-"""Smallest variation of slip, as a share of the usual variation, for a robot whose wheels roll."""
+"""Variation of slip of a robot whose wheels roll, as a share of the usual variation."""
 
 
 @dataclass(frozen=True)
 class StateWindows(Windows):
-    """Displacement and turn over windows of the wheels' distance, linear in the parameters that may be unknown.
+    """Displacement and turn over windows of the wheels' distance, linear in the unknown parameters.
 
     Attributes
     ----------
     residuals : (3 w,) forward, right [m] and turn [rad] of the wheels' motion minus the states' motion
     jacobian : (3 w, 6) by y_icr_right, y_icr_left, x_icr [m], heading offset [rad], scale of both wheels, difference
-    turned_rad : (w,) turn by the wheels; end_m : (w,) their distance at the end; stretch : (w,) number of its stretch
-    distance_m : of the wheels, whole drive
-    separation_m : y right - y left of the ICRs that give the wheels' motion
+    turned_rad : (w,) turn by the wheels; end_m : (w,) distance of the wheels at the end of each window
+    stretch : (w,) number of the stretch of each window
+    distance_m : distance of the wheels in the whole drive
+    separation_m : y right - y left of the ICRs that convert the wheels' motion
     noise : (3,) standard deviation of each kind of residual by the noise of the states
     """
 
@@ -81,15 +82,15 @@ class StateWindows(Windows):
 
 
 def cut_states(table: States, track: Track, track_width_m: float | None) -> StateWindows:
-    """Return windows of states that follow one another, with the motion by constant ICRs.
+    """Return consecutive windows of states, with the motion of the wheels by constant ICRs.
 
-    The ICRs are the run's final ones where they are possible, else ICRs from the track width.
+    The ICRs are the final ICRs of the run if they are possible, else ICRs from the track width.
 
     Parameters
     ----------
     table : the recorded states
-    track : the same as a track
-    track_width_m : b, None where not known
+    track : track of the same states
+    track_width_m : track width b; None if it is not known
     """
     right, left, x = table.icrs_at(-1)
     half = width_or_usual_m(track_width_m) / 2
@@ -145,24 +146,24 @@ def final_covariance(
 
     Parameters
     ----------
-    windows : with the final ICRs; y right - y left is also the prior standard deviation
-    filter_covariance : (3, 3) of the ICRs at the end; with the process noise it gives the filter's memory
-    process_icr_mps : process noise of the filter
-    track_width_m : b; None: not known
-    since_s : time of the last terrain change; the drive before shows other ICRs
+    windows : windows with the motion by the final ICRs; y right - y left is also the prior standard deviation
+    filter_covariance : (3, 3) covariance of the ICRs at the end; with the process noise it gives the filter's memory
+    process_icr_mps : process noise of the ICRs in the filter
+    track_width_m : track width b; None if it is not known
+    since_s : time of the last terrain change; the drive before it shows other ICRs
 
     Notes
     -----
-    The filter's own covariance assumes that the ICRs vary with its process noise. On even ground its variance is four
-    times too large, and it does not include slip that varies along the drive. Here the result is the sandwich
+    The filter's own covariance assumes that the ICRs vary with the process noise. On even ground its variance is four
+    times too large, and it does not include slip that varies along the drive. This function returns the sandwich
     covariance (Liang and Zeger 1986) of a fit over the windows, clustered by stretches of `STRETCH_IN_WINDOWS`, with
-    heading offset and wheel scales marginalised. The expected difference between stretches (`Y_OF_STRETCH`) is added
-    with the weight of one stretch. The residuals are computed with the final ICRs, so that a difference between filter
-    and fit increases the covariance. Their scale is at least the noise of the states, because states follow poor fixes
-    only slowly. The weight of a window is exp(-distance since / D), where D = P / q is the memory of a Kalman filter
-    with variance P and process noise q by distance.
+    heading offset and wheel scales marginalised. The expected difference between stretches (`Y_OF_STRETCH`) counts as
+    one further stretch. The residuals are computed with the final ICRs, so that a difference between filter and fit
+    increases the covariance. Their scale is at least the noise of the states, because states follow poor fixes slowly.
+    The weight of a window is exp(-d / D), with the distance d from its end to the end of the drive, and the memory
+    D = P / q of a Kalman filter with variance P and process noise q by distance.
 
-    Coverage of 2 standard deviations, combined for pairs:
+    Share of differences within 2 standard deviations (of both numbers of a pair together):
 
     - Parts of one log, five recorded Warthog drives on grass and asphalt and one of a Husky: halves y 11 of 12, x 5 of
       6; thirds y 27 of 28, x all of 14; quarters y 50 of 52, x all of 26.
@@ -172,7 +173,8 @@ def final_covariance(
     - 117 simulated drives with random sensors and faults, compared with the same filter on true poses of the same
       drive: y all, x 98 %. This reference contains the drive's own slip, so it is closer than another drive.
 
-    Halves of recorded drives are the least certain, most of all in x_icr, because they have different turns and speeds.
+    The coverage is smallest for halves of recorded drives, in particular of x_icr, because the halves have different
+    turns and speeds.
     """
     width_m, is_recent = windows.separation_m, windows.track.t[windows.begin] >= since_s
     if np.count_nonzero(is_recent) < 2:
@@ -202,26 +204,26 @@ SLIP_SHARE = 0.03
 """Standard deviation of slip from window to window, as a share of distance and of turn."""
 
 SHOWN_SHARE, WEAK_SHARE = 0.03, 0.1
-"""Largest standard deviations of an ICR that is shown, and of an ICR that is weakly shown, as shares of y right - y
+"""Largest standard deviations of an ICR that is shown, and of an ICR that is weakly shown, as a share of y right - y
 left."""
 
 AT_LIMIT = 1.1
-"""Ratio of a y ICR to the filter's limit below which it is the limit and not an estimate."""
+"""Ratio of a y ICR to the filter's limit below which the ICR counts as the limit and not as an estimate."""
 
 TURNS_NEEDED_RAD = math.pi
 """Sum of the turns to both sides below which a drive lacks turns [rad]."""
 
 STEERS = 0.1
-"""Ratio of the turn by the sides to the robot's turn below which the sides do not turn the robot."""
+"""Ratio of the turn by the difference of the sides to the robot's turn below which the sides do not turn the robot."""
 
 SURELY_TURNED_RAD = 0.1
-"""Smallest turn that counts for this ratio [rad]. It is larger than the error of headings."""
+"""Smallest turn that counts in this ratio [rad]. It is larger than the errors of headings."""
 
 ONE_DIRECTION = 0.15
-"""Ratio of the turns to one side to the turns to the other below which a drive turns in one direction."""
+"""Ratio of the turns to one side to the turns to the other side below which a drive turns in one direction only."""
 
 SPIN_RATIO = 3.0
-"""Ratio of the sides' difference to their mean from which on a turn is a spin."""
+"""Ratio of the difference of the sides to their mean above which a turn is a spin."""
 
 
 def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> ExcitationDocument:
@@ -229,14 +231,14 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
 
     Parameters
     ----------
-    windows : of the recorded states
-    unlearned : result of `unlearned_icrs`; these ICRs are not shown, even if the drive could show them
+    windows : windows of the recorded states
+    unlearned : result of `unlearned_icrs`; these ICRs count as not shown, even if the drive could show them
 
     Notes
     -----
-    The Fisher information of constant ICRs in displacements and heading changes over windows of distance, with the
-    filter's own uncertainties and some slip as noise, after the heading's offset and the wheels' scales are
-    marginalised. This information is the most that a drive could show; the filter may have learned less.
+    Fisher information of constant ICRs in displacements and heading changes over windows of distance. The noise is the
+    filter's own uncertainty and some slip; heading offset and wheel scales are marginalised. This is the largest
+    information that the drive could give; the filter may have learned less.
     """
     track, width = windows.track, windows.separation_m
     slip = SLIP_SHARE * np.abs([windows.length_m, windows.length_m, windows.turned_rad])
@@ -268,7 +270,7 @@ def _turns(track: Track, width_m: float) -> tuple[Floats, Bools]:
     for lo in range(0, len(track.t), ROWS_AT_ONCE):
         chunk = slice(lo, lo + ROWS_AT_ONCE)
         left, right = track.v_left[chunk], track.v_right[chunk]
-        # noise of encoders at rest is no turn
+        # The noise of encoders at rest is not a turn.
         moving = np.abs(left) + np.abs(right) > 0.02
         turns[chunk] = np.where(moving, track.held[chunk] * (left - right) / width_m, 0.0)
         spins[chunk] = np.abs(left - right) > SPIN_RATIO * np.abs(left + right) / 2
@@ -276,13 +278,13 @@ def _turns(track: Track, width_m: float) -> tuple[Floats, Bools]:
 
 
 def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[str, str]:
-    """Return the final ICRs that the filter did not learn from the drive, and why not.
+    """Return the final ICRs that the filter did not learn from the drive, with the reasons.
 
     Parameters
     ----------
     table : the recorded states
-    std_m : (3,) of the final ICRs, `icrtool.estimation.observability.final_covariance`
-    least_icr_m : the filter keeps both y ICRs at least this far from the centre line; -inf: anywhere
+    std_m : (3,) standard deviations of the final ICRs, from `final_covariance`
+    least_icr_m : smallest distance of the y ICRs from the centre line in the filter; -inf: no limit
     """
     final, reasons = dict(zip(ICR_COLUMNS, table.icrs_at(-1), strict=True)), dict[str, str]()
     width = max(final["y_icr_right_m"] - final["y_icr_left_m"], MIN_ICR_SEPARATION_M)
@@ -298,7 +300,7 @@ def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[
 def _lacking(
     stds: dict[str, float], verdicts: dict[str, Excited], turned_right: float, turned_left: float, windows: StateWindows
 ) -> list[Note]:
-    """Return findings about ICRs that are not shown: the reason, and what to drive."""
+    """Return the findings about ICRs that are not shown, with the reason and what to drive."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return []
@@ -318,7 +320,7 @@ def _lacking(
 
 
 def lacking_turns(right_rad: float, residual_rad: float) -> str:
-    """Return which turns a drive lacks and what to drive, from its turns to either side; empty where it has enough."""
+    """Return which turns a drive lacks and what to drive, from its turns to both sides; empty if it has enough."""
     total = right_rad + residual_rad
     if total < TURNS_NEEDED_RAD:
         return f"hardly any turns ({math.degrees(total):.0f}° in all): {SPIN_BOTH}"

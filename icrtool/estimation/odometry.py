@@ -1,4 +1,4 @@
-"""Distance and speed of a run, paths of its wheels alone (Pentzer 2014, Section 6.1), and headings without GNSS."""
+"""Distance and speed of a run, paths by its wheels alone (Pentzer 2014, Section 6.1), and headings without GNSS."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHORTEST_STEP_M, STEP_IN_STD = 0.1, 5.0
 """Smallest length of a chord of the driven path, in metres and in standard deviations of the position."""
 
 LEAST_MODELLED = 0.5
-"""Ratio of the model's distance to a chord from which on the speed within the chord follows the model."""
+"""Ratio of the model's distance to a chord above which the speed within the chord follows the model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class OdometryPath:
 
     Attributes
     ----------
-    north_m, east_m : float64 (n,), at every recorded state, or at some of them
+    north_m, east_m : float64 (n,), at every recorded state or at some states
     heading_rad : float64 (n,), clockwise from north, unwrapped
     end_error_m : distance to the filter's estimate at the last state
     mean_error_m, max_error_m : mean and largest distance to the filter's estimate, over every recorded state
@@ -55,7 +55,7 @@ def momentary_icrs(table: States) -> FrozenIcrs:
 
 
 def odometry_icrs(table: States, track_width_m: float | None) -> dict[OdometryName, FrozenIcrs]:
-    """Return the ICRs of a drive's odometries: final, momentary, and where b is known the ICRs without slip.
+    """Return the ICRs of each odometry of a drive: final, momentary and, if b is known, without slip.
 
     Notes
     -----
@@ -71,19 +71,19 @@ def odometry_icrs(table: States, track_width_m: float | None) -> dict[OdometryNa
 
 
 def drive_wheels(table: States, in_gap: Bools, icrs: FrozenIcrs, every: int = 1) -> OdometryPath:
-    """Return the path of the wheels from the first state to the last; in a gap of the wheel data it follows the filter.
+    """Return the path by wheel speeds from the first state to the last; it follows the filter in gaps.
 
     Parameters
     ----------
     table : the recorded states
-    in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
+    in_gap : bool (n,), whether the interval after each state is a gap in the wheel data
     icrs : one triple for the whole path, or one for each state
-    every : number of states between two kept points of the path; the last state is kept, too
+    every : number of states from one kept point of the path to the next; the last state is kept, too
 
     Notes
     -----
-    The motion of the wheels in a gap is not known. The filter's displacement replaces it, turned by the heading error
-    of the odometry at the begin of the gap, so that a gap does not change the error.
+    The motion of the wheels in a gap is not known. It is replaced by the filter's displacement, turned by the heading
+    error of the odometry at the begin of the gap, so that a gap does not change the error.
     """
     kept = np.append(np.arange(0, len(table) - 1, every), len(table) - 1)
     path, total_m, largest_m = OpenLoopPath(*np.empty((3, len(kept)))), 0.0, 0.0
@@ -98,7 +98,7 @@ def drive_wheels(table: States, in_gap: Bools, icrs: FrozenIcrs, every: int = 1)
 
 
 def _pieces(table: States, in_gap: Bools, icrs: FrozenIcrs) -> Iterator[tuple[slice, OpenLoopPath]]:
-    """Yield the path of `drive_wheels` in order, some states at a time: a whole path is as long as a column."""
+    """Yield the path of `drive_wheels` in order, some states at a time, because a whole path is large."""
     track = track_of_states(table, in_gap, np.empty((0, 2), np.int64))
     edges = np.flatnonzero(in_gap[:-1])
     miss_north, miss_east, turned = 0.0, 0.0, 0.0
@@ -106,7 +106,8 @@ def _pieces(table: States, in_gap: Bools, icrs: FrozenIcrs) -> Iterator[tuple[sl
         north, east, psi = float(track.north[first]), float(track.east[first]), float(track.heading[first])
         cos, sin = math.cos(turned), math.sin(turned)
         if first:
-            # The heading error at the gap's begin rotates the displacement: rotated displacement minus displacement.
+            # The displacement is rotated by the heading error at the begin of the gap. This is the resulting
+            # difference.
             step_north, step_east = north - float(track.north[first - 1]), east - float(track.east[first - 1])
             miss_north += step_north * cos - step_east * sin - step_north
             miss_east += step_north * sin + step_east * cos - step_east
@@ -127,9 +128,10 @@ def _pieces(table: States, in_gap: Bools, icrs: FrozenIcrs) -> Iterator[tuple[sl
 
 
 def _without_jumps(table: States, jumps: Iterable[ReferenceJump]) -> tuple[Floats, Floats]:
-    """Return the positions of states (n,), north and east [m], without the steps that the reference made alone.
+    """Return the positions of states (n,), north and east [m], without the jumps of the reference.
 
-    Across a jump the robot is taken to have driven on as its states did before it, for the distance of its wheels.
+    Across a jump the robot is assumed to drive on in the direction of its states before the jump, for the distance of
+    its wheels.
     """
     north, east = table.north_m.copy(), table.east_m.copy()
     for jump in jumps:
@@ -153,13 +155,14 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
 
     Parameters
     ----------
-    jumps : of the reference; their length does not count as driven
+    table : the recorded states
+    jumps : jumps of the reference; their length does not count as driven
 
     Notes
     -----
-    The distance is the sum of chords between positions that lie a step apart: longer than their noise, so that a
-    parked robot stays where it is. Wheels that turn on the spot do not count. Between the ends of a chord the speed
-    follows the model. It is constant where the model shows less than half of the chord.
+    The distance is the sum of chords between positions. A chord is longer than the noise of the positions, so that a
+    parked robot has no distance, and a spin on the spot has none. Within a chord the speed follows the model; it is
+    constant if the model shows less than half of the chord.
     """
     interval, duration = np.diff(table.t_s), float(table.t_s[-1])
     noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m), overwrite_input=True))
@@ -167,11 +170,11 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
     rows = chord_rows(north, east, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
     chords = np.hypot(np.diff(north[rows]), np.diff(east[rows]))
     if rows[-1] != len(table) - 1:
-        # the rest at the end is shorter than a step and does not count
+        # The rest at the end is shorter than a chord and does not count.
         rows, chords = np.append(rows, len(table) - 1), np.append(chords, 0.0)
     distance = float(chords.sum())
     modelled, lasted = np.diff(table.distance_m[rows]), np.diff(table.t_s[rows])
-    # in a gap of the wheel data the model stands still
+    # The model stands still in a gap of the wheel data.
     is_modelled = LEAST_MODELLED * chords < modelled
     stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=is_modelled)
     even = np.divide(chords, lasted, out=np.zeros(len(chords)), where=~is_modelled & (lasted > 0))
@@ -186,14 +189,14 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
 
 
 LONGEST_GYRO_HOLE_S = 1.0
-"""Longest time without a sample in a gyro that is used [s]."""
+"""Longest time without a sample of a gyro that is used [s]."""
 
 
 def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
-    """Yield the headings measured independently of the position reference, a gyro's before an attitude sensor's.
+    """Yield the headings that are measured without the position reference: first of a gyro, then of an attitude sensor.
 
-    A heading is left out if it needs positions (it was estimated, or it is a field of the position's messages), or if
-    it does not cover the run.
+    A heading is left out if it depends on positions (it was estimated, or it is a field of the messages of the
+    position), or if it does not cover the run.
     """
     sensors = run.sensors
     stamps = run.table.stamp_ns
@@ -211,19 +214,20 @@ def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
 
 
 def _since(stamp_ns: Ints, epoch_ns: Ints) -> Floats:
+    """Return stamps as seconds since the first stamp of `epoch_ns`."""
     since: Floats = (stamp_ns - epoch_ns[0]) / 1e9
     return since
 
 
 def _covers(measured_ns: Ints, states_ns: Ints) -> bool:
-    """Return whether measurements reach from the first state to the last without a long hole."""
+    """Return whether measurements reach from the first state to the last, without a hole of `LONGEST_GYRO_HOLE_S`."""
     hole = LONGEST_GYRO_HOLE_S * 1e9
     within = measured_ns[(measured_ns > states_ns[0]) & (measured_ns < states_ns[-1])]
     return bool(np.max(np.diff(np.concatenate([states_ns[:1], within, states_ns[-1:]]))) < hole)
 
 
 def _integrate(t: Floats, rate: Floats, at: Floats) -> Floats:
-    """Return the turn [rad] up to each state at times `at`: trapezoids, first and last rate held beyond the samples."""
+    """Return the turn [rad] until each of the times `at`: by trapezoids; beyond the samples the rate is constant."""
     whole, turned = np.empty(len(at)), trapezoids(t, rate)
     for lo in range(0, len(at), ROWS_AT_ONCE):
         chunk = at[lo : lo + ROWS_AT_ONCE]

@@ -1,4 +1,4 @@
-"""The filter stage: from aligned sensors to recorded states (Pentzer 2014, Section 3), and the smoother over them.
+"""The filter and the smoother of a run: from aligned sensors to states (Pentzer 2014, Section 3).
 
 The filter runs with the process noise of the pose that the innovations of the log show.
 """
@@ -46,22 +46,22 @@ LONGEST_CARRY_S, CLEARLY = 1.0, 2.0
 standard deviation to its own. With a smaller ratio the filter's heading is kept."""
 
 LEAST_WHEEL_TRAVEL_M = 0.1
-"""Distance that wheels roll forward and backward together, below which they have not turned [m]."""
+"""Sum of the distances that wheels roll forward and backward, below which they have not turned [m]."""
 
 FAR_IN_SIGMAS = 6.0
 """Spread of positions, in their standard deviations, above which the robot has moved."""
 
 
 class Filtered(NamedTuple):
-    """Results of the filter, with the names of `icrtool.records.run.Run`.
+    """Results of the filter; `icrtool.records.run.Run` describes the fields that are not listed here.
 
     Attributes
     ----------
-    covariance : (6, 6) at the end
-    noise : process noise of the pose that the run was made with
+    covariance : (6, 6) covariance of the last state
+    noise : process noise of the pose in the run
     least_icr_m : smallest distance of the y ICRs from the centre line in the filter; -inf: no limit
-    began_with : ICRs and covariance of the warm start, None without one
-    icr_start : ICRs that it started from where there is no warm start
+    began_with : ICRs and covariance of the warm start; None without a warm start
+    icr_start : ICRs at the start of a run without a warm start
     changes_s : terrain changes, seconds since the first recorded state, in order
     """
 
@@ -86,14 +86,21 @@ def run_filter(
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
 ) -> Filtered:
-    """Return the results of the filter over the sensors of a log; parameters as in `icrtool.pipeline.fit_log`.
+    """Return the results of the filter over the sensors of a log.
+
+    Parameters
+    ----------
+    sensors : the aligned streams
+    config : the configuration
+    warm_start : ICRs and covariance that the filter starts from; default: configured
+    changes_s : terrain changes, seconds since the first recorded state
 
     Raises
     ------
     DataError
-        No wheel sample after the first fix and the first heading; wheels that never turn.
+        There is no wheel sample after the first fix and the first heading, or the wheels never turn.
     ConfigError
-        A start that preset ``field`` does not take.
+        Preset ``field`` refuses the configured start.
     """
     check_start(config)
     _check_motion(sensors)
@@ -128,7 +135,7 @@ def run_filter(
 
 
 def _check_motion(sensors: SensorData) -> None:
-    """Refuse wheels that never turn: there is nothing to learn ICRs from."""
+    """Refuse wheels that never turn, because they show no ICRs."""
     wheels, fixes = sensors.wheels, sensors.fixes
     interval = np.diff(wheels.stamp_ns) / 1e9
     travelled = [
@@ -137,7 +144,7 @@ def _check_motion(sensors: SensorData) -> None:
     ]
     if max(travelled) >= LEAST_WHEEL_TRAVEL_M:
         return
-    # a few fixes may be wrong
+    # A few fixes may be wrong, so percentiles are used.
     north, east = (float(np.subtract(*np.percentile(column, [95, 5]))) for column in (fixes.north_m, fixes.east_m))
     moved, noise_m = math.hypot(north, east), float(np.sqrt(np.median(fixes.var_north_m2 + fixes.var_east_m2)))
     if moved > max(LEAST_WHEEL_TRAVEL_M, FAR_IN_SIGMAS * noise_m):
@@ -167,8 +174,8 @@ def noise_of(run: Run) -> ProcessNoise:
 
 
 TOLERATED_NIS = 1.25
-"""Largest mean NIS of a stream per degree of freedom, each NIS limited to its gate. 1 is expected with the right
-noise."""
+"""Largest mean NIS of a stream, per degree of freedom, that is tolerated. Each NIS is limited to its gate; with the
+right noise the mean is 1."""
 
 STEP = 2.0
 """Factor between two tried process noises."""
@@ -180,17 +187,17 @@ LARGEST_HEADING_DEGPS = 120.0
 """Largest process noise of the heading [deg/s]."""
 
 TAIL_DEGREES = 4.0
-"""Degrees of freedom of Student's t: Lange, Little and Taylor 1989 recommend it where outliers are few but gross."""
+"""Degrees of freedom of Student's t. Lange, Little and Taylor 1989 recommend this value for few, gross outliers."""
 
 LIKE_COST = 0.1
-"""Largest difference of two costs per measurement that count as equal. An error of 5 % in both deviations costs
-this."""
+"""Largest difference of two costs per measurement that count as equal. An error of 5 % in both standard deviations has
+this cost."""
 
 MOST_ROUNDS = 3
 """Largest number of searches over both noises."""
 
 Moving = tuple[Bools, Bools]
-"""Which fixes (m,) and which headings (h,) were measured while the wheels turned."""
+"""Flags of the fixes (m,) and headings (h,) that were measured while the wheels turned."""
 
 MOST_SEARCHED_SAMPLES = 60_000
 """Largest number of wheel samples in the search: ten minutes at 100 Hz."""
@@ -199,12 +206,10 @@ MOST_SEARCHED_SAMPLES = 60_000
 def run_adaptively(
     sensors: SensorData, config: Config, warm_start: WarmStart | None, changes_s: tuple[float, ...]
 ) -> tuple[FilterParameters, FilterOutput, ProcessNoise]:
-    """Run the filter, with more process noise where fixes or headings contradict the wheels.
+    """Return parameters and output of the filter, and the process noise of the pose in it.
 
-    Returns parameters and output of the run, and the process noise that it was made with.
-
-    The noise is searched for on at most ten minutes of driving; a log without contradiction takes one pass. Preset
-    ``field`` only; configured noise is not searched for.
+    If fixes or headings contradict the wheels, the process noise is increased, unless it is configured or preset is
+    ``paper``. It is searched for on at most ten minutes of driving; a log without contradiction takes one pass.
     """
 
     def run(streams: SensorData, noise: ProcessNoise) -> tuple[FilterParameters, FilterOutput]:
@@ -216,14 +221,14 @@ def run_adaptively(
     if not settings.rules.measures_noise:
         return parameters, output, noise
     moving = sensors.moving()
-    # mean NIS per degree of freedom, each counted up to its gate
+    # The mean NIS is per degree of freedom, and each NIS is limited to its gate.
     nis = (
         np.minimum(output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]], parameters.gnss_gate) / 2.0,
         np.minimum(output.heading_nis[(output.heading_code > UNSEEN) & moving[1]], parameters.heading_gate),
     )
     if all(not len(values) or values.mean() <= TOLERATED_NIS for values in nis):
         return parameters, output, noise
-    del output, nis  # frees memory for the next run
+    del output, nis  # The memory is freed for the next run.
     wander_rad, largest = sensors.facts.turn_wander_rad, LARGEST_HEADING_DEGPS
     if wander_rad is not None:
         largest = min(largest, STEP * math.degrees(wander_rad) / math.sqrt(REFERENCE_STEP_S))
@@ -240,7 +245,7 @@ def run_adaptively(
 
 
 def _busiest_part(sensors: SensorData) -> SensorData:
-    """Return the `MOST_SEARCHED_SAMPLES` wheel samples in which the wheels travel most, all where there are no more."""
+    """Return the streams during the `MOST_SEARCHED_SAMPLES` wheel samples in which the wheels travel most."""
     wheels = sensors.wheels
     if len(wheels.stamp_ns) <= MOST_SEARCHED_SAMPLES:
         return sensors
@@ -257,17 +262,17 @@ def find_noise(
     headings: bool,
     largest_degps: float = LARGEST_HEADING_DEGPS,
 ) -> ProcessNoise:
-    """Return the smallest process noise, from `start` up by doubling, whose cost equals the smallest cost.
+    """Return the smallest process noise, by doublings of `start`, whose cost is about the smallest cost.
 
     Parameters
     ----------
-    cost : by noise, see `innovation_cost`
-    positions, headings : whether the noise of the position, and of the heading, is searched for
-    largest_degps : upper limit of the heading's noise: difference between the turns of heading and wheels
+    cost : returns the cost of a noise, for example `innovation_cost`
+    positions, headings : search for the noise of the position, and of the heading
+    largest_degps : upper limit of the heading's noise, from the difference between the turns of heading and wheels
 
     Notes
     -----
-    The coordinates are searched one after the other, each over all its doublings: with too small a noise nearly all
+    Both noises are searched for in turn, each over all its doublings: if the noise is far too small, nearly all
     measurements are rejected, and the first doublings may change nothing. Costs within `LIKE_COST` of the smallest cost
     count as equal.
     """
@@ -294,15 +299,16 @@ def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float
 
     Parameters
     ----------
-    moving : which fixes (m,) and headings (h,) count; None: all
+    output : output of the filter
+    moving : flags of the fixes (m,) and headings (h,) that count; None: all count
 
     Notes
     -----
     Twice the negative log-likelihood of innovations with covariance S under Student's t with nu = `TAIL_DEGREES`,
-    without its constant: (nu + d) ln(1 + NIS / nu) + ln det S, rejected ones included (Lange, Little and Taylor 1989).
-    A normal likelihood would raise the noise for a few gross errors. A likelihood limited to the gate would be best
-    where all measurements are rejected. Means are used because errors of a fast stream's samples are correlated, so
-    that their number must not be a weight.
+    without its constant: (nu + d) ln(1 + NIS / nu) + ln det S, also of rejected ones (Lange, Little and Taylor 1989). A
+    normal likelihood would raise the noise for a few gross errors. A likelihood limited to the gate would be best if
+    all measurements were rejected. Means are used, because the errors of a fast stream are correlated, so that the
+    number of its samples must not be a weight.
     """
     fixes = output.gnss_code > UNSEEN
     headings = (output.heading_code > UNSEEN) & (output.heading_nis > 0.0)
@@ -318,7 +324,7 @@ def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float
 
 
 def _states(wheels: WheelSamples, output: FilterOutput) -> States:
-    """Return the recorded states from the columns of the output; its variances are converted to deviations in place."""
+    """Return the recorded states in the output; its variances become standard deviations in place."""
     first = len(wheels.stamp_ns) - len(output.x)
     stamps = wheels.stamp_ns[first:]
     std = np.maximum(output.variance, 0.0, out=output.variance)
@@ -335,10 +341,10 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
 
 
 def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
-    """Extend precise and `used` headings (h,) by the wheels' turn, as headings of the states; changes the states.
+    """Set the headings of states to the last precise heading that was `used` (h,), turned on by the wheels.
 
     The filter averages headings to learn the ICRs, but a single heading is closer to the body's heading than the
-    average.
+    average. The states are changed in place.
     """
     if not (sensors.facts.headings_are_precise and used.any()):
         return
@@ -358,10 +364,10 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
 
 
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:
-    """Return the spans between usable fixes that are long enough to be outages, (k, 2) [ns].
+    """Return the spans between used fixes that are long enough to be outages, (k, 2) [ns].
 
-    A fix that the gate rejected does not move the filter, and does not end an outage. Where RTK was lost, the fixes
-    there do not count: the filter drove on with its wheels.
+    A fix that the gate rejected does not move the filter, and does not end an outage. While RTK was lost, fixes do not
+    count, because the filter drove on with its wheels.
     """
     lost = np.zeros(len(gnss.stamp_ns), np.bool_)
     for begin, end in rtk_losses_ns:
@@ -390,12 +396,12 @@ def smooth_run(run: Run) -> States:
     Returns
     -------
     States
-        One row per state of the run, at the same stamps. The path length is computed with the smoothed ICRs.
+        The smoothed states, at the stamps of the run's states. Their path length is computed with the smoothed ICRs.
 
     Notes
     -----
-    The smoother uses the filter's noises: where the wheels contradict the reference, the smoothed ICRs still vary with
-    the process noise `filter.process_icr_mps`.
+    The smoother uses the noises of the filter, so that the smoothed ICRs vary with the process noise
+    `filter.process_icr_mps`, too.
     """
     setup = set_up_again(run)
     smoothed = run_smoother(*setup)
@@ -411,7 +417,7 @@ def smooth_run(run: Run) -> States:
 
 
 def _distance(run: Run, x: Floats) -> Floats:
-    """Return the path length (n,) [m] with the smoothed ICRs, as Eqs. 8-12 have it; gaps add nothing."""
+    """Return the path length (n,) [m] by the smoothed ICRs (Eqs. 8-12); gaps add nothing."""
     table = run.table
     right, left, ahead = x[:, 3], x[:, 4], x[:, 5]
     width = np.maximum(np.abs(left - right), MIN_ICR_SEPARATION_M)

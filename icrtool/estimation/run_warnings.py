@@ -21,25 +21,25 @@ from icrtool.records.run_document import ExcitationDocument
 from icrtool.records.tables import States
 
 MULTIPLIERS = (0.9, 6.0)
-"""Smallest and largest distance between the ICRs of a robot that slips, in track widths."""
+"""Smallest and largest usual distance between the ICRs of a robot that slips, in track widths."""
 
 ROLLS = 0.02
 """Largest difference of the multiplier from 1, if two standard deviations are smaller, at which a robot does not slip
 in turns. Track widths are measured no more accurately."""
 
 ROLLS_STD = 0.05
-"""Largest standard deviation of the multiplier for this finding."""
+"""Largest standard deviation of the multiplier with which a robot can be found not to slip."""
 
 LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
-"""Distance of the ICRs' middle from the sensor above which they are not symmetric: in metres and in standard
-deviations, the larger one."""
+"""Distance of the ICRs' middle from the sensor above which the ICRs are not symmetric [m], and in standard deviations.
+The larger one counts."""
 
 USUAL_X_M = 0.15
-"""Usual largest distance of x_icr from the body origin for skid-steer robots [m] (Pentzer 2014: 0.06 and 0.14 m)."""
+"""Largest usual distance of x_icr from the body origin of skid-steer robots [m] (Pentzer 2014: 0.06 and 0.14 m)."""
 
 TWIST_SIGMAS = 2.0
 """Excess of the ICRs' separation over the track width, in standard deviations, below which a body twist turns as the
-robot does: its controller then corrects the slip."""
+robot does, because its controller corrects the slip."""
 
 WORTH_WARNING_SHARE = 0.1
 """Share of rejected measurements from which on there is a warning."""
@@ -48,15 +48,15 @@ DELAY_SIGMAS = 3.0
 """Delay above which the clock of a stream is the cause of rejected measurements, in standard deviations."""
 
 LARGEST_TURN_UNEXPLAINED, UNEXPLAINED_SIGMAS = 0.5, 2.0
-"""Unexplained share of the turns' variance above which wheels explain almost none of the turns, and the number of
-standard deviations by which it must be above."""
+"""Unexplained share of the variance of turns above which the wheels explain almost none of the turns, and number of
+standard deviations by which the share must exceed it."""
 
 USELESS_HEADING_DEGPS = 50.0
-"""Heading noise above which the wheels are useless for turns [deg/s]. The heading by wheels then errs by 5 deg after 1
-s."""
+"""Noise of the heading above which the wheels do not show turns [deg/s]. The heading by wheels is then wrong by 5 deg
+after 1 s."""
 
 CONTRADICTION_SIGMAS, CONTRADICTION_SHARE = 3.0, 0.1
-"""Difference of two estimates of a y ICR above which they contradict each other: in standard deviations, and as a share
+"""Difference of two estimates of a y ICR above which they contradict each other, in standard deviations and as a share
 of the separation. Both must be exceeded."""
 
 UNUSABLE_SHARE = 0.3
@@ -64,7 +64,7 @@ UNUSABLE_SHARE = 0.3
 
 REJECTED = {"fixes": "fixes_rejected", "headings": "headings_rejected"}
 MOSTLY_REJECTED = {"fixes": "fixes_mostly_rejected", "headings": "headings_mostly_rejected"}
-"""Codes of findings about rejected fixes and headings; `MOSTLY_REJECTED` is for a run that is not usable."""
+"""Codes of findings about rejected fixes and headings. `MOSTLY_REJECTED` is for a run that is not usable."""
 
 
 def unusable_reasons(
@@ -79,17 +79,20 @@ def unusable_reasons(
     *,
     inverted: bool = False,
 ) -> list[Note]:
-    """Return why the ICRs of a run must not be used, as grave findings; empty where they can be.
+    """Return why the ICRs of a run must not be used, as grave findings; empty if they can be used.
 
     Parameters
     ----------
+    excitation : ICRs that the drive shows
     rejected : `rejected_share` of the fixes, and of the headings
-    contradiction : of `contradicts_windows`
-    filtered : evidence that a filter made the wheel speeds; it is then the only reason
+    noise : process noise of the pose
+    wheel_scale : finding about the scale of the wheels
     twist_separation : (y_r - y_l) / b by a body twist that was converted with b, and its standard deviation; None for
         other wheels
-    wheels : facts about them; without compared turns, the filter's noise of the heading decides
-    inverted : the right ICR ended left of the left one
+    contradiction : result of `contradicts_windows`
+    filtered : evidence that a filter made the wheel speeds, which is then the only reason
+    wheels : facts about the wheels; without compared turns, the filter's noise of the heading decides
+    inverted : the right ICR ended left of the left ICR
     """
     if filtered:
         needed = "wheel speeds are needed: topics.wheels names their topic"
@@ -122,7 +125,7 @@ def unusable_reasons(
 
 
 def _why_turns_unexplained(wheels: WheelFacts | None) -> str:
-    """Return why the turns are not explained; empty where the wheels explain most of their variance, or may do so."""
+    """Return why the turns are not explained; empty if the wheels may explain most of their variance."""
     slip = "do they slip, as on ice?"
     if wheels is None or wheels.turn_unexplained is None or wheels.turn_unexplained_std is None:
         return f"the wheels explain almost none of the turns: {slip}"
@@ -135,13 +138,12 @@ def _why_turns_unexplained(wheels: WheelFacts | None) -> str:
 
 
 def _twist_reasons(separation: float, std: float) -> list[Note]:
-    """Return why a body twist shows no ICRs, by their separation in track widths; none where the separation is larger.
+    """Return why a body twist shows no ICRs, from their separation in track widths; empty if it may show them.
 
     Notes
     -----
-    If a twist turns as the robot does, the separation of its ICRs equals the width that it was converted with.
-    Differential drives turn by a few percent less than their wheels, so that the separation of their ICRs is larger by
-    more than its deviation.
+    If a twist turns as the robot does, the separation of its ICRs equals the width that it was converted with. A
+    skid-steer robot turns less than its wheels, so that the separation is larger by more than its standard deviation.
     """
     if separation >= 1.0 + TWIST_SIGMAS * std:
         return []
@@ -153,12 +155,13 @@ def _twist_reasons(separation: float, std: float) -> list[Note]:
 
 
 def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str, Finding]) -> str:
-    """Return how the final y ICRs contradict the ICRs from windows of the drive; empty where they agree.
+    """Return how the final y ICRs contradict the ICRs from windows of the drive; empty if they agree.
 
     Parameters
     ----------
-    covariance : (3, 3) of the final ICRs [m^2]
-    findings : of the alignment; without ICRs nothing is compared
+    table : the recorded states
+    covariance : (3, 3) covariance of the final ICRs [m^2]
+    findings : findings of the alignment; without ICRs among them nothing is compared
 
     Notes
     -----
@@ -181,13 +184,13 @@ def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str
 
 
 def rejected_share(code: Bytes) -> float:
-    """Return the share of the measurements within the run, by their codes (m,), that the gate rejected; 0 for none."""
+    """Return the share of the measurements in the run that the gate rejected, from their codes (m,); 0 for none."""
     seen = code[code > UNSEEN]
     return float((seen == GATED).mean()) if len(seen) else 0.0
 
 
 def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[Note]:
-    """Return findings about noise that was raised because wheels contradict the reference."""
+    """Return the findings about process noise that was raised, because the wheels contradict the reference."""
     configured, notes = configured_noise(config), list[Note]()
     if noise.position_mps != configured.position_mps:
         causes = "slip, clock offsets, repeated samples, fixes worse than they state"
@@ -214,10 +217,12 @@ def run_warnings(
 
     Parameters
     ----------
+    name : name of the log
     rejected : `rejected_share` of the fixes, and of the headings
-    multiplier : (y_r - y_l) / b and its standard deviation; None where b is not known, or the run is not usable
-    findings : of the alignment
-    inverted : the right ICR ended left of the left one
+    multiplier : (y_r - y_l) / b and its standard deviation; None if b is not known, or the run is not usable
+    excitation : ICRs that the drive shows
+    findings : findings of the alignment
+    inverted : the right ICR ended left of the left ICR
     """
     notes = list[Note]()
     if multiplier is not None and excitation.verdict.shows_sides:
@@ -252,11 +257,13 @@ def _cause_of_rejection(delay: Finding | None) -> str:
 
 
 def antenna_warning(name: str, table: States, covariance: Floats) -> list[Note]:
-    """Return a finding where both ICRs lie to one side of a position sensor whose place on the robot is not known.
+    """Return a finding if both ICRs lie to one side of a position sensor whose place on the robot is not known.
 
     Parameters
     ----------
-    covariance : (3, 3) of the final ICRs [m^2]
+    name : name of the log
+    table : the recorded states
+    covariance : (3, 3) covariance of the final ICRs [m^2]
 
     Notes
     -----

@@ -73,7 +73,7 @@ def summarise(
     datum: Datum | None,
     rejected_fixes: dict[str, int],
 ) -> RunDocument:
-    """Return all numbers and warnings of a run.
+    """Return the document of a run: all its numbers and warnings.
 
     Parameters
     ----------
@@ -81,7 +81,8 @@ def summarise(
     filtered : result of the filter
     config : the effective configuration
     request : request of the fit
-    inputs, datum, rejected_fixes : of the log
+    inputs, datum : files and datum of the log
+    rejected_fixes : number of fixes that were left out before the filter, by reason
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
@@ -151,7 +152,7 @@ def _unusable_reasons(
     excitation: ExcitationDocument, changes_s: Sequence[float], covariance: Floats, rejected: dict[str, float], *,
     inverted: bool,
 ) -> list[Note]:  # fmt: skip
-    """Return why the ICRs must not be used; none where they can be. Parameters: as of `_notes`."""
+    """Return why the ICRs must not be used; empty if they can be used. `summarise` computes the arguments."""
     corrects, wheels = config.filter.rules.corrects, measurements.wheels
     of_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
     one_ground = not changes_s and wheels.ground_change_s is None
@@ -166,7 +167,7 @@ def _unusable_reasons(
 
 
 def _odometry(table: States, in_gap: Bools, width_m: float | None) -> OdometryDocument:
-    """Return the errors of the paths by wheel speeds alone."""
+    """Return the errors of the paths by wheel speeds alone over the whole drive."""
     errors: dict[OdometryName, PathErrorDocument] = {}
     for name, icrs in odometry_icrs(table, width_m).items():
         path = drive_wheels(table, in_gap, icrs, len(table))
@@ -179,7 +180,7 @@ def _notes(
     excitation: ExcitationDocument, changes_s: Sequence[float], covariance: Floats,
     rejected: dict[str, float], *, inverted: bool,
 ) -> tuple[Note, ...]:  # fmt: skip
-    """Return the findings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
+    """Return the findings of alignment and filter, in the order in which they were found."""
     name, table = filtered.sensors.name, filtered.table
     end_s = float(table.t_s[-1])
     return (
@@ -224,27 +225,39 @@ def filter_summary(measurements: Measurements, filtered: Filtered, config: Confi
 
 
 def _count(marked: Bools) -> int:
+    """Return the number of marked rows."""
     return int(np.count_nonzero(marked))
 
 
 def _mean(values: Floats) -> float | None:
+    """Return the mean of values; None without values."""
     return finite_or_none(float(values.mean())) if len(values) else None
 
 
 def _spans(stamps_ns: Ints) -> Spans:
+    """Return spans (k, 2) [ns] as they are stored."""
     return tuple((int(begin), int(end)) for begin, end in stamps_ns)
 
 
 def assess_icrs(
     filtered: Filtered, config: Config, clock_std_s: float = 0.0
 ) -> tuple[Floats, ExcitationDocument, float]:
-    """Return the covariance (3, 3) of the final ICRs [m^2], what was shown, and the clocks' part of x_icr's std [m].
+    """Return the covariance of the final ICRs, the ICRs that the drive shows, and the clocks' part of the std of x_icr.
 
     Parameters
     ----------
-    clock_std_s : standard deviation of the time between position and heading; a lag of positions has the same effect as
+    filtered, config : result of the filter, and the configuration
+    clock_std_s : standard deviation of the time between position and heading. A lag of positions has the same effect as
         an x_icr further back
 
+    Returns
+    -------
+    covariance : (3, 3) [m^2]
+    excitation : verdict on each ICR
+    x_clock_std_m : part of the clocks in the standard deviation of x_icr
+
+    Notes
+    -----
     In preset ``paper`` the covariance is the filter's own, and an ICR counts as shown if the drive could show it.
     """
     table, width = filtered.table, config.robot.track_width_m
@@ -266,7 +279,7 @@ def assess_icrs(
 
 
 def _speed_while_turning(table: States) -> float:
-    """Return the mean speed [m/s] of a drive, weighted by the square of the difference of the sides."""
+    """Return the mean speed [m/s] of a drive, weighted by the square of the difference of the side speeds."""
     turning = table.v_left_mps - table.v_right_mps
     turning *= turning
     turning[:-1] *= np.diff(table.t_s)
@@ -275,7 +288,7 @@ def _speed_while_turning(table: States) -> float:
 
 
 def _seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, float]:
-    """Return begin and end of a span in seconds since the first recorded state, of stamp `start_ns`."""
+    """Return begin and end of a span in seconds since the first recorded state, whose stamp is `start_ns`."""
     return {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
 
 
@@ -283,19 +296,21 @@ def icr_summary(
     table: States, convergence: dict[IcrColumn, tuple[float, float] | None], covariance: Floats, of_filter: Floats,
     x_clock_std_m: float, multiplier: tuple[float, float] | None, hidden: Collection[str],
 ) -> IcrDocument:  # fmt: skip
-    """Return the ICRs: final, mean and standard deviation over the states after convergence, and its times.
+    """Return the ICRs of the filter: final, mean and standard deviation after convergence, and convergence times.
 
     Parameters
     ----------
-    covariance : (3, 3) of the final ICRs [m^2]; of_filter : the filter's own
-    x_clock_std_m : part of the clocks in the standard deviation of x
-    multiplier : (y_r - y_l) / b and its standard deviation, None where b is not known
-    hidden : ICRs that are not shown; they have no number, and a multiplier computed from one has no number either
+    table, convergence : the recorded states, and the result of `converge`
+    covariance, of_filter : (3, 3) covariance of the final ICRs, and the filter's own covariance [m^2]
+    x_clock_std_m : part of the clocks in the standard deviation of x_icr
+    multiplier : (y_r - y_l) / b and its standard deviation; None if b is not known
+    hidden : ICRs that are not shown; they become null, and so does a multiplier that is computed from one
     """
     settled = max((span[1] for span in convergence.values() if span is not None), default=0.0)
     after = table.t_s >= settled
 
     def by_icr(values: Iterable[float]) -> NumberByIcr:
+        """Return numbers by ICR; None for hidden ICRs."""
         rows = zip(ICR_COLUMNS, values, strict=True)
         return NumberByIcr(*(None if column in hidden else finite_or_none(value) for column, value in rows))
 
@@ -320,7 +335,7 @@ def icr_summary(
 
 
 def segment_summary(table: States, changes_s: tuple[float, ...]) -> tuple[SegmentDocument, ...]:
-    """Return mean and standard deviation of the ICRs over the second half of each stretch between terrain changes."""
+    """Return mean and standard deviation of the ICRs in the second half of each stretch between terrain changes."""
     segments = []
     for begin, end in pairwise([0.0, *sorted(changes_s), float(table.t_s[-1])] if changes_s else []):
         inside = (table.t_s >= (begin + end) / 2) & (table.t_s <= end)
@@ -334,7 +349,7 @@ def segment_summary(table: States, changes_s: tuple[float, ...]) -> tuple[Segmen
 
 
 def separation_multiplier(table: States, track_width_m: float) -> float:
-    """Return (y_r - y_l)/b of the final estimates: the wheel_separation_multiplier of a ROS diff-drive controller."""
+    """Return (y_r - y_l) / b of the final estimates, the wheel_separation_multiplier of a diff_drive_controller."""
     separation = abs(float(table.y_icr_right_m[-1]) - float(table.y_icr_left_m[-1]))
     return max(separation, MIN_ICR_SEPARATION_M) / track_width_m
 
@@ -343,7 +358,7 @@ def gnss_summary(
     datum: Datum | None, rejected_fixes: dict[str, int], outcome: MeasurementOutcome, fixes: Fixes,
     measurements: Measurements,
 ) -> GnssDocument:  # fmt: skip
-    """Return numbers of used and rejected fixes, also by class, and the filter's distance from the fixes it trusts."""
+    """Return the numbers of used and rejected fixes, also by class, and the filter's distance from the used fixes."""
     delay = measurements.findings["position_delay_s"]
     difference = outcome.difference[outcome.used & ~fixes.down_weighted]
     classes = {

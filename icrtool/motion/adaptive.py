@@ -1,9 +1,9 @@
-"""A motion model that learns from the past of a drive, sample by sample: on board, and as row ``adaptive`` of a report.
+"""A motion model that learns from the past of a drive, on a robot and as row ``adaptive`` of a report.
 
-The model begins with a prior from a calibration or from other robots. Each window of driven distance that has ended
-adds to the normal equations, with the terms, residuals, weights and priors of `icrtool.motion.window_fit`. Gauss-Newton
-steps give the next solution. On the first `REBUILT_TO_M` of a drive the normal equations are also computed anew from
-time to time, because the first windows were linearised far from the later solution.
+The model begins with a prior from a calibration or from other robots. Each window of driven distance that has ended is
+added to the normal equations, with the terms, residuals, weights and priors of `icrtool.motion.window_fit`.
+Gauss-Newton steps give the next solution. On the first `REBUILT_TO_M` of a drive, the normal equations are also
+computed anew from time to time, because the first windows were linearised far from the later solution.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from icrtool.motion.window_fit import (
 )
 
 WINDOWS_AS_ONE = 80.0
-"""Number of windows that count as one independent window. A stretch of 20 m holds 120 windows and shows a term between
-one and two times."""
+"""Number of windows that count as one independent window. A stretch of 20 m has 120 windows, and the information of one
+to two independent windows."""
 
 GAUSS_NEWTON_STEPS = 3
 """Number of Gauss-Newton steps from one solution to the next."""
@@ -47,31 +47,31 @@ SHORTEST_M, LONGEST_M = 0.5, 6.0
 """Shortest and longest distance between two solutions [m]."""
 
 REBUILT_SHARE = 0.3
-"""Growth of the driven distance, as a share, after which all windows are linearised anew."""
+"""Growth of the driven distance after which all windows are linearised anew, as a share of the distance."""
 
 REBUILT_TO_M = 150.0
 """Driven distance up to which all windows are linearised anew [m]."""
 
 SETTLE_S = 0.5
-"""Time from the end of a window to its use [s]: the wheels may be read later than the poses by `LARGEST_DELAY_S`."""
+"""Time from the end of a window to its use [s]. The wheels may be read up to `LARGEST_DELAY_S` later than the poses."""
 
 LARGEST_DELAY_S = 0.4
 """Largest delay between wheels and poses [s], four standard deviations of its prior."""
 
 FEWEST_FOR_WANDER = 60
-"""Number of windows from which on the wander of the heading is estimated. From fewer windows it would be the error of
-the prior."""
+"""Smallest number of windows from which the wander of the heading is estimated. With fewer windows, the estimate would
+be the error of the prior."""
 
 USUAL_STD = (0.02, 0.02)
-"""Spread of residuals that is assumed before a drive, of displacements [m^0.5] and of turns [rad/m^0.5]. With 0.03 the
-expected error after 10 m is 3 % larger on 18 simulated robots of which nothing is known."""
+"""Assumed standard deviations of residuals before a drive, of displacements [m^0.5] and of turns [rad/m^0.5]. With
+0.03, the expected error after 10 m is 3 % larger on 18 simulated robots of which nothing is known."""
 
 USUAL_COUNTS_AS = 4.0
-"""Number of independent windows that `USUAL_STD` counts as. The first few windows are always fitted almost exactly, so
-their residuals do not show the spread."""
+"""Number of independent windows that `USUAL_STD` counts as. The first windows are fitted almost exactly, so their
+residuals do not show the standard deviation."""
 
 MOST_PENDING = 1000
-"""Number of samples after which the pending samples of a robot that stands are taken."""
+"""Largest number of pending samples. While a robot stands, samples are pending until this number is reached."""
 
 WHEELS_MODEL, TURNED_MODEL = MODELS[RECOMMENDED], MODELS[RECOMMENDED].with_gyro()
 """The models with wheels alone, and with wheels and gyro."""
@@ -94,7 +94,7 @@ class TermsPrior:
     width_m : track width b that the terms refer to [m]
     mean, covariance : (8,), (8, 8)
     turned_mean, turned_covariance : of the terms of the model with a gyro (6,), (6, 6)
-    source : origin of the prior, in a few words
+    source : source of the prior, in a few words
     constants, turned_constants : prior of the drive's constants, with wheels alone and with a gyro
     """
 
@@ -120,13 +120,13 @@ class TermsPrior:
 
 
 class Learned(NamedTuple):
-    """The model and constants that are known from one time of a drive on.
+    """The model and constants that are known from a time of a drive on.
 
     Attributes
     ----------
-    t_s : the time [s]; distance_m : driven by then
-    fitted, constants : the model by the wheels alone, and the constants of the drive
-    turned, turned_constants : the model with a gyro; None without one
+    t_s : the time [s]; distance_m : distance driven until then
+    fitted, constants : the model with wheels alone, and the constants of the drive for this model
+    turned, turned_constants : the model with a gyro, and its constants; the model is None without a gyro
     """
 
     t_s: float
@@ -142,12 +142,13 @@ class Estimate:
 
     Attributes
     ----------
-    x : (k + c,) parameters, then `LogConstants`; mean, prior : (k + c,), (k + c, k + c) mean and information before
-    pull : (k + c,) information times mean before
-    matrix, vector : (k + c, k + c), (k + c,) of the data: x solves (prior + matrix) x = prior mean + vector
+    x : (k + c,) parameters, then `LogConstants`
+    mean, prior : (k + c,), (k + c, k + c) mean and information before the drive
+    pull : (k + c,) product of information and mean before the drive
+    matrix, vector : (k + c, k + c), (k + c,) of the data: x solves (prior + matrix) x = pull + vector
     scale : (2,) robust standard deviation of the residuals of displacements and turns
-    wander : of the heading, for each metre [rad^2/m]
-    fitted, constants : x as the model and the constants that predict
+    wander : growth of the variance of the heading for each metre [rad^2/m]
+    fitted, constants : x as a model and constants, for predictions
     """
 
     def __init__(
@@ -207,6 +208,7 @@ class Estimate:
         return normal_equations(target, jacobian, weights)
 
     def _step(self, matrix: Floats, vector: Floats) -> None:
+        """Replace x by the solution of the normal equations of prior and data."""
         x = np.linalg.solve(self.prior + matrix, self.pull + vector)
         delay = len(self.model.terms) + LogConstants._fields.index("wheels_later_s")
         x[delay] = np.clip(x[delay], -LARGEST_DELAY_S, LARGEST_DELAY_S)
@@ -214,6 +216,7 @@ class Estimate:
             self.x = x
 
     def _finish(self, wheels: FittedModel | None) -> None:
+        """Set model and constants from x; `wheels` as in `residuals_of`."""
         k = len(self.model.terms)
         covariance = np.linalg.inv(self.prior + self.matrix)[:k, :k]
         self.fitted = FittedModel(self.model, self.x[:k], covariance, wheels)
@@ -229,19 +232,19 @@ def _scale_of(residuals: Floats, kind: Ints) -> Floats:
 
 
 class AdaptiveModel:
-    """A motion model that starts from a prior and learns from the samples of a drive as they come.
+    """A motion model that starts from a prior and learns from the samples of a drive when they come.
 
-    Frames and signs follow `icrtool`: x forward, y right, turns clockwise. The model is plain NumPy, holds some
-    kilobytes, and opens no file or log.
+    Frames and signs follow `icrtool`: x forward, y right, turns clockwise. The model needs only NumPy and some
+    kilobytes of memory, and opens no file or log.
 
     Parameters
     ----------
-    prior : of `icrtool.Calibration.prior`, or `icrtool.prior_of_robots`
-    with_gyro : turn by a gyro and the wheels; each sample then needs the gyro's turn rate
+    prior : result of `icrtool.Calibration.prior` or `icrtool.prior_of_robots`
+    with_gyro : compute the turn rate from gyro and wheels; each sample then needs the turn rate of the gyro
 
     Attributes
     ----------
-    distance_m : driven until the last sample
+    distance_m : distance driven until the last sample
     """
 
     def __init__(self, prior: TermsPrior, *, with_gyro: bool = False) -> None:
@@ -277,12 +280,12 @@ class AdaptiveModel:
 
         Parameters
         ----------
-        t_s : its time, of any clock, ascending
+        t_s : time of the sample, of any clock, ascending
         v_left, v_right : wheel speeds [m/s] at the configured radius, which hold until the next sample
-        pose : north, east [m] and heading [rad] of the reference at that time; None while there is none (no GNSS)
+        pose : north, east [m] and heading [rad] of the reference at this time; None without a pose (no GNSS)
         gyro_radps : turn rate of the gyro, clockwise
-        broken : the robot slips, or the reference jumps, before the next sample: no window crosses it
-        gap : the wheels are not known until the next sample
+        broken : the robot slips or the reference jumps before the next sample, so that no window crosses this interval
+        gap : wheel samples were lost before the next sample
         """
         begin = self._begin_s = t_s if self._begin_s is None else self._begin_s
         north, east, heading = (np.nan, np.nan, np.nan) if pose is None else pose
@@ -304,7 +307,7 @@ class AdaptiveModel:
         return bool(self._take(samples))
 
     def observe_all(self, samples: Floats) -> list[Learned]:
-        """Take many samples (10, n), in rows `icrtool.motion.drive_buffer.SampleRow`; return the learned models.
+        """Take many samples (10, n), in rows `icrtool.motion.drive_buffer.SampleRow`; return all learned models.
 
         Notes
         -----
@@ -336,7 +339,7 @@ class AdaptiveModel:
         return twist[:, 0] if np.ndim(v_left) == 0 else twist
 
     def _take(self, samples: Floats) -> list[Learned]:
-        """Take samples, and solve at each knot where a solution is due."""
+        """Take samples, and solve at each knot at which a new solution is due; return all learned models."""
         rows_taken = []
         for knot in range(self._drive.take(samples), self._drive.count):
             at_m, size = knot * self._drive.every_m, self._drive.size
@@ -350,7 +353,7 @@ class AdaptiveModel:
         return rows_taken
 
     def _solve(self, knot: int, at_m: float) -> bool:
-        """Solve with the windows that have ended at a knot; return whether there were new ones."""
+        """Solve with the windows that have ended at a knot; return whether there were new windows."""
         last = self._drive.last_by(self._drive.time_of(knot) - SETTLE_S)
         windows = self._drive.windows(self._used, last, knot)
         self._used = max(self._used, last + 1)

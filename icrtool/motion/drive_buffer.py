@@ -1,6 +1,6 @@
-"""The past of a drive, sample by sample: wheel samples joined to steps, poses kept every half metre, windows of them.
+"""The past of a drive: wheel samples that are joined to steps, poses at every half metre, and windows of both.
 
-The result depends on the samples alone, not on the number of samples that come at a time.
+The result depends on the samples, and not on the number of samples that come at a time.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from icrtool.kernels.track import LONGEST_DELAY_S, Track, Windows
 from icrtool.motion.recording import EVERY_M, RECORDING_STEP_S
 
 LEARNT_WINDOWS_M = (1.0, 2.0, 5.0)
-"""Lengths of the windows that are learned from [m]. Short windows end first. With windows of 10 m too, the expected
-error after 10 m is as large on 18 simulated robots of which nothing is known, and 5 % larger on recorded drives of one
-robot; with 5 and 10 m alone it is 8 and 9 % larger."""
+"""Lengths of the windows that a model learns from [m]. With further windows of 10 m, the expected error after 10 m does
+not change on 18 simulated robots of which nothing is known, and is 5 % larger on recorded drives of one robot. With
+windows of 5 and 10 m alone, it is 8 and 9 % larger."""
 
 STANDING_STEP_S = 10.0
-"""Length of the steps to which the wheel samples of a robot that stands are joined [s]. It may stand for hours."""
+"""Length of the steps to which wheel samples are joined while a robot stands [s]. It may stand for hours."""
 
 LARGEST_ADVANCE_M = 5.0
-"""Largest distance that wheels roll between two samples [m]. A longer distance shows a damaged speed or stamp, and is
-treated as a gap."""
+"""Largest distance that wheels roll between two samples [m]. A longer distance comes from a damaged speed or stamp, and
+counts as a gap."""
 
 ON_EDGE = 1e-6
 """Share of a step by which a stamp may precede the begin of the step. Decimal fractions of a second are not exact."""
@@ -55,9 +55,9 @@ class DriveBuffer:
 
     Attributes
     ----------
-    size : part of the usual distances that is used (`icrtool.motion.recording.size_of`)
+    size : factor of the usual distances (`icrtool.motion.recording.size_of`)
     every_m : distance between knots [m]
-    count : number of the knots, the forgotten ones included
+    count : number of the knots, with the forgotten ones
     """
 
     def __init__(self, size: float) -> None:
@@ -84,7 +84,7 @@ class DriveBuffer:
             return first_knot
         rows = np.concatenate([self._open, samples], axis=1)
         held, advance, gap = _intervals(rows, self.size)
-        # the interval before each new sample; the first sample of a drive has none
+        # These are the intervals before the new samples. The first sample of a drive has none.
         before = slice(max(old - 1, 0), None)
         distance = np.cumsum(np.append(self._distance, advance[before]))
         ends = gap[before] | (rows[SampleRow.BROKEN, :-1][before] > 0.0)
@@ -101,7 +101,7 @@ class DriveBuffer:
         ).all(axis=0)
         heading = self._unwrapped(rows[SampleRow.HEADING, old:], is_known[old:])
         number, first = _step_of(rows, gap)
-        # knots come first: they count the steps that were complete before these samples
+        # Knots are added first, because they count the steps that were complete before these samples.
         at = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
         row = old + at
         pose = [np.where(is_known[row], column, 0.0) for column in (*rows[POSE_ROWS[:2]][:, row], heading[at])]
@@ -144,19 +144,19 @@ class DriveBuffer:
         return float(self._knots[KNOT_T, knot - self._knots_before])
 
     def last_by(self, t_s: float) -> int:
-        """Return the number of the last knot by a time."""
+        """Return the number of the last knot at or before a time [s]."""
         return self._knots_before + int(np.searchsorted(self._knots[KNOT_T], t_s, side="right")) - 1
 
     def windows(self, first: int, last: int, now: int) -> Windows | None:
-        """Return the windows that end at the knots from `first` to `last`; None where there is none.
+        """Return the windows that end at the knots from `first` to `last`; None without windows.
 
         Parameters
         ----------
-        now : last knot at which the wheels are known: the track has the steps that were complete at this knot
+        now : last knot at which the wheels are known; the track has the steps that were complete at this knot
 
         Notes
         -----
-        As `icrtool.kernels.track.cut`: no window crosses a gap, a jump or a slip event, or has an end without a pose.
+        No window crosses a gap, a jump or a slip event, or ends without a pose, as in `icrtool.kernels.track.cut`.
         """
         knots, before = self._knots, self._knots_before
         segment, is_known = knots[KNOT_SEGMENT], knots[KNOT_KNOWN] > 0.0
@@ -183,7 +183,7 @@ class DriveBuffer:
         return Windows(track, begin.astype(np.int64) - lo, end.astype(np.int64) - lo, length)
 
     def forget_until(self, end: int) -> None:
-        """Drop the steps and knots that windows ending at the knot `end` or later do not need."""
+        """Drop the steps and knots that are not needed by windows that end at knot `end` or later."""
         keep = end - round(max(LEARNT_WINDOWS_M) / EVERY_M)
         drop = keep - self._knots_before
         if drop <= 0:
@@ -195,7 +195,7 @@ class DriveBuffer:
 
 
 def _intervals(rows: Floats, size: float) -> tuple[Floats, Floats, Bools]:
-    """Return how long each sample but the last holds [s], how far the wheels roll then [m], and whether it is a gap."""
+    """Return for each sample but the last: time that it holds [s], distance of the wheels [m], whether it is a gap."""
     held = np.diff(rows[SampleRow.T])
     advance = np.abs((rows[SampleRow.LEFT, :-1] + rows[SampleRow.RIGHT, :-1]) / 2.0) * held
     gap = (rows[SampleRow.GAP, :-1] > 0.0) | ~(held >= 0.0) | ~(advance <= LARGEST_ADVANCE_M * size)

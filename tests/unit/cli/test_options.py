@@ -58,7 +58,7 @@ def test_a_change_replaces_what_is_given_of_another_record(monkeypatch: pytest.M
 def test_an_empty_name_is_not_the_current_directory(arguments: tuple[str, ...]) -> None:
     done = CliRunner().invoke(command_line, list(arguments))
     assert done.exit_code == 2
-    assert "an empty name" in done.output
+    assert "the name is empty" in done.output
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -344,19 +344,19 @@ def test_a_command_that_writes_while_another_uploads_changes_nothing_and_the_run
     store, monkeypatch, capfd, mcap, group
 ):
     """The other command begins and ends before each group of files of this one; it states another living process."""
-    each, others, calls = remote_place._Store._each, [], []
-    other = f"{writer().partition('-')[0]}-{os.getppid()}-0123abcd"
+    each, others, calls = remote_place._Store._ask_for_each, [], []
+    other = f"{writer_id().partition('-')[0]}-{os.getppid()}-0123abcd"
 
     def between(self, request, files):
         if isinstance(request, functools.partial):
             calls.append(0)
             if len(calls) == group + 1:
                 with monkeypatch.context() as patch:
-                    patch.setattr(remote_place, "writer", lambda: other)
+                    patch.setattr(remote_place, "writer_id", lambda: other)
                     others.append(run(patch, capfd, *fit_command(mcap), "--smooth", "-q")[0])
         return each(self, request, files)
 
-    monkeypatch.setattr(remote_place._Store, "_each", between)
+    monkeypatch.setattr(remote_place._Store, "_ask_for_each", between)
     status, said = run(monkeypatch, capfd, *fit_command(mcap))
     assert status == 0, said
     assert others == [1]
