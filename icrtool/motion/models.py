@@ -1,10 +1,10 @@
 """Motion models that are linear in their parameters: body twist (v_x, v_y, omega) = sum theta_k phi_k(V_l, V_r).
 
-A `Term` is one phi with its prior, a `MotionModel` a list of terms. Adding either is one entry below. Body frame: x
-forward, y right, omega clockwise. Track width b, v = (V_l + V_r) / 2, w = (V_l - V_r) / b. Speeds refer to the
-configured wheel radius.
+A `Term` is one phi with its prior, and a `MotionModel` is a list of terms. A new term or model is one entry in this
+module. Body frame: x forward, y right, omega clockwise. Track width b, v = (V_l + V_r) / 2, w = (V_l - V_r) / b. Speeds
+refer to the configured wheel radius.
 
-The track ICRs (Pentzer 2014, Eqs. 8-12) are a member: with W = y_r - y_l the twist is
+The model of track ICRs (Pentzer 2014, Eqs. 8-12) is one of them: with W = y_r - y_l the twist is
 v_x = v + (y_r + y_l) / W w b / 2, v_y = -2 x / W w b / 2, omega = b / W w. The no-slip model has no free terms.
 """
 
@@ -30,7 +30,7 @@ class WheelMotion(NamedTuple):
     v, w : mean speed [m/s], (V_l - V_r) / b [rad/s]
     spin : |V_l - V_r| / (|V_l| + |V_r|): 0 straight ahead, 1 on the spot
     b : track width [m]
-    gyro : turn rate of a gyro [rad/s], clockwise; turn : turn rate of a wheels-only model [rad/s]; zeros where not used
+    gyro : turn rate of a gyro [rad/s], clockwise; turn : turn rate of a wheels-only model [rad/s]; zeros if not used
     """
 
     v: Floats
@@ -52,15 +52,17 @@ def wheel_motion(v_left: Floats, v_right: Floats, width_m: float, gyro: Floats |
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One column of the model.
+    """One term of a motion model.
 
     Attributes
     ----------
-    axis : which of v_x, v_y, omega it adds to
-    column : its value per unit parameter, (n,); formula : the same in the symbols of `WheelMotion`, for other programs
-    mean, std : prior of the parameter: mean and spread of real robots
+    name : name of the parameter
+    axis : velocity that the term adds to: `VX`, `VY` or `OMEGA`
+    column : returns the velocity (n,) for a parameter of 1
+    formula : the same in the symbols of `WheelMotion`, for other programs
+    mean, std : prior of the parameter: mean and standard deviation over real robots
     wide : standard deviation of a wider prior, for a term that few drives show; 0: no wider prior
-    meaning : words for a reader, with source
+    meaning : words for the term, with its source
     nominal : the parameter without slip
     """
 
@@ -106,8 +108,8 @@ class MotionModel:
 
     Attributes
     ----------
-    label : for tables
-    source : who proposed it
+    label : words for the model in tables
+    source : publication that proposed the model
     stds : prior standard deviations of a fit, where they differ from the terms' own
     """
 
@@ -128,19 +130,19 @@ class MotionModel:
         return np.array(self.stds or [TERMS[name].std for name in self.terms])
 
     def widened(self) -> MotionModel | None:
-        """Return the model with the wide prior of each term that has a wide prior; None without such a term."""
+        """Return the model with wide priors of the terms that have a wide prior; None without such terms."""
         if self.stds or not any(TERMS[name].wide for name in self.terms):
             return None
         return replace(self, stds=tuple(TERMS[name].wide or TERMS[name].std for name in self.terms))
 
     def as_shown(self, widened: FittedModel) -> MotionModel:
-        """Return the model with the priors that a fit of `widened` gives.
+        """Return the model with the priors that follow from a fit of the `widened` model.
 
         Notes
         -----
-        Few drives show how slip changes with curvature and speed, so the priors are narrow. If the wide fit gives a
-        parameter theta with |theta| > `SHOWN_SIGMAS` standard deviations s, the variance of its prior grows by
-        theta^2 - (`SHOWN_SIGMAS` s)^2 (empirical Bayes, positive part: Efron and Morris 1973).
+        Few drives show how slip changes with curvature and speed, so these priors are narrow. If the fit with wide
+        priors gives a parameter theta of more than `SHOWN_SIGMAS` standard deviations s, the variance of its prior
+        grows by theta^2 - (`SHOWN_SIGMAS` s)^2 (empirical Bayes, positive part: Efron and Morris 1973).
         """
         beyond = widened.parameters**2 - (SHOWN_SIGMAS * widened.std) ** 2
         wide = np.array([TERMS[name].wide > 0.0 for name in self.terms])
@@ -159,10 +161,11 @@ class MotionModel:
 
 
 NO_SLIP, FIVE, RECOMMENDED = "no_slip", "five", "recommended"
-"""Names of the models that are fitted: without free terms; for ICRs and controller; for predictions."""
+"""Names of the fitted models: the model without free terms, the model for ICRs and controller, the model that
+predicts."""
 
 CONTROLLER = "controller"
-"""Name of the row that drives like a differential-drive controller, with multiplier and radius factors of `FIVE`."""
+"""Name of the row of a differential-drive controller with the multiplier and radius factors of `FIVE`."""
 
 _FIVE = ("vx_v", "vx_w", "omega_w", "omega_v", "vy_w")
 _EIGHT = (*_FIVE, "vy_vw", "omega_sw", "omega_vw")
@@ -184,7 +187,7 @@ MODELS: dict[str, MotionModel] = {
 """The models that are fitted, by name."""
 
 FULL_LINEAR = MotionModel("full_linear", "full linear", (*_FIVE, "vy_v"), "Anousaki 2004")
-"""Model that is linear in both wheel speeds; the filter's ICRs are stated in its terms, and it is not fitted."""
+"""Model that is linear in both wheel speeds. It is not fitted; the filter's ICRs are converted to its terms."""
 
 
 def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Ints, Floats]:
@@ -209,9 +212,9 @@ class TrackGeometry(NamedTuple):
 
     Attributes
     ----------
-    y_icr_right_m, y_icr_left_m, x_icr_m : track ICRs
-    multiplier : (y_r - y_l) / b; it is used together with the radius factors
-    radius_left, radius_right : wheel radius over the configured one
+    y_icr_right_m, y_icr_left_m, x_icr_m : track ICRs, body frame
+    multiplier : (y_r - y_l) / b, for use together with the radius factors
+    radius_left, radius_right : ratio of the wheel radius to the configured radius
     """
 
     y_icr_right_m: float
@@ -227,7 +230,7 @@ ICR_VALUES = 3
 
 
 def track_geometry(model: MotionModel, parameters: NDArray[Any], width_m: float) -> TrackGeometry:
-    """Return ICRs, multiplier and radius factors of a model; terms that are not linear in the speeds do not enter.
+    """Return ICRs, multiplier and radius factors of a model, without the terms that are not linear in the speeds.
 
     Notes
     -----
@@ -237,7 +240,7 @@ def track_geometry(model: MotionModel, parameters: NDArray[Any], width_m: float)
     """
     by_term = dict(zip(model.terms, parameters.tolist(), strict=True))
     term = {name: by_term.get(name, TERMS[name].nominal) for name in _FIVE}
-    # v = (V_l + V_r) / 2 and w = (V_l - V_r) / b: half the sum and half the difference of the columns
+    # With v = (V_l + V_r) / 2 and w = (V_l - V_r) / b, these are half sums and half differences of the columns.
     x_left, x_right = (term["vx_v"] + term["vx_w"]) / 2.0, (term["vx_v"] - term["vx_w"]) / 2.0
     turn_left = (term["omega_v"] / 2.0 + term["omega_w"]) / width_m
     turn_right = (term["omega_v"] / 2.0 - term["omega_w"]) / width_m
@@ -254,7 +257,7 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
 
     Parameters
     ----------
-    icrs_m : y_icr_right, y_icr_left, x_icr
+    icrs_m : (3,) y_icr_right, y_icr_left, x_icr
     width_m : track width b of the terms
 
     Returns
@@ -285,11 +288,12 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
 
 
 NOT_SHOWN = 0.7
-"""Ratio of a parameter's standard deviation to its prior's above which the drive does not show the parameter. A
-parameter that differs from the prior's mean by two standard deviations or more counts as shown all the same."""
+"""Ratio of the standard deviation of a parameter to the standard deviation of its prior above which the drive does not
+show the parameter. A parameter that is two standard deviations or more from the prior's mean counts as shown in any
+case."""
 
 SHOWN_SIGMAS = 3.0
-"""Number of standard deviations that a parameter must differ from zero to widen its prior."""
+"""Size of a parameter, in its standard deviations, above which its prior is widened."""
 
 TINY = 1e-20
 """Size of a complex step."""
@@ -297,7 +301,7 @@ TINY = 1e-20
 
 @dataclass(frozen=True, slots=True)
 class FittedModel:
-    """A model of the family with its parameters.
+    """A motion model with fitted parameters.
 
     Attributes
     ----------
@@ -318,7 +322,7 @@ class FittedModel:
 
     @property
     def not_shown(self) -> tuple[str, ...]:
-        """Names of the terms that the data did not show: they rest on the prior."""
+        """Names of the terms that the data did not show; their parameters come from the prior."""
         hardly_narrowed = self.std / self.model.prior_std > NOT_SHOWN
         near = np.abs(self.parameters - self.model.prior_mean) < 2.0 * self.std
         return tuple(name for name, unseen in zip(self.model.terms, hardly_narrowed & near, strict=True) if unseen)
@@ -337,7 +341,7 @@ class FittedModel:
     def geometry(self, width_m: float) -> tuple[TrackGeometry, Floats]:
         """Return ICRs, multiplier and radius factors, and their covariance (6, 6)."""
         at = track_geometry(self.model, self.parameters, width_m)
-        # complex steps (Squire and Trapp 1998)
+        # The derivatives come from complex steps (Squire and Trapp 1998).
         moved = self.parameters + TINY * 1j * np.eye(len(self.parameters))
         columns = [np.imag(track_geometry(self.model, parameters, width_m)) / TINY for parameters in moved]
         by_parameter = np.reshape(columns, (len(moved), len(at)))
@@ -346,7 +350,7 @@ class FittedModel:
 
 
 class Lever(NamedTuple):
-    """Whether it is known how far ahead, and how far to the right, of the body's origin the position is measured.
+    """Which parts of the lever from the body's origin to the measured position are known: ahead, and to the right.
 
     An unknown part has the same effect as ICRs off centre. It is a constant of the log, not an error of a controller.
     """
@@ -364,7 +368,8 @@ def controller_model(five: FittedModel, lever: Lever, width_m: float) -> FittedM
     Parameters
     ----------
     five : the fit, with the turn rate of the wheels, or of wheels and gyro
-    lever : of the position; for an unknown part, the velocity that a turn gives to the measured point is kept
+    lever : known parts of the lever; for an unknown part, the velocity of the measured point in a turn is kept
+    width_m : track width b
 
     Notes
     -----

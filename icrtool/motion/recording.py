@@ -1,6 +1,6 @@
-"""Data to fit and test motion models: wheel speeds, reference, gyro; windows of distance, and open-loop trials.
+"""Data to which motion models are fitted and on which they are tested: wheels, reference, gyro; windows and trials.
 
-The gyro is compared with the heading by one line, which alignment uses too.
+The turns of a gyro are compared with the turns of the reference by a line, also in the alignment.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from icrtool.motion.models import NO_LEVER, FittedModel, Lever, wheel_motion
 from icrtool.records.measurements import TURNING_MPS
 
 WINDOWS_M = (5.0, 10.0)
-"""Lengths of the windows [m]. With one length alone, a circle of this circumference would show nothing."""
+"""Lengths of the windows [m]. With one length alone, a drive on a circle of this circumference would show nothing."""
 
 FULL_SIZE_WIDTH_M = 0.5
-"""Track width from which on windows and stretches have their full length [m]. For smaller robots all lengths shrink in
-proportion, as their paths and errors do."""
+"""Track width above which windows and stretches have their full length [m]. For smaller robots all lengths are smaller
+in proportion, because their paths and errors are smaller, too."""
 
 EVERY_M = 0.5
 """Distance between the starts of two windows of one length [m]."""
 
 MOST_STARTS = 800
-"""Approximate number of windows of one length in all logs together. On long drives windows start further apart."""
+"""Approximate largest number of windows of one length in all logs together. On long drives windows start further
+apart."""
 
 LEAST_OFTEN_M = 2.5
-"""Largest distance between the starts of two windows [m]: half the shortest window."""
+"""Largest distance between the starts of two windows [m]: half of the shortest window."""
 
 RECORDING_STEP_S = 0.1
 """Length of the steps to which wheel samples are joined [s]."""
@@ -57,10 +58,10 @@ class LogConstants(NamedTuple):
 
     Attributes
     ----------
-    heading_offset_rad : added to the heading of the reference
-    wheels_later_s : the wheels are read this much later than the poses
-    gyro_bias_radps : added to the turn rate of a model with a gyro
-    gyro_later_s : the gyro is read this much later than the wheels, to first order
+    heading_offset_rad : angle that is added to the heading of the reference
+    wheels_later_s : time by which the wheels are read later than the poses
+    gyro_bias_radps : turn rate that is added to the turn rate of a model with a gyro
+    gyro_later_s : time by which the gyro is read later than the wheels, to first order
     """
 
     heading_offset_rad: float = 0.0
@@ -77,6 +78,7 @@ class LogConstants(NamedTuple):
         return self._summed(other, -1.0)
 
     def _summed(self, other: LogConstants, sign: float) -> LogConstants:
+        """Return the sum with `sign` times other constants."""
         offset, *others = (value + sign * two for value, two in zip(self, other, strict=True))
         return LogConstants(math.remainder(offset, 2.0 * math.pi), *others)
 
@@ -91,17 +93,18 @@ class Recording:
 
     Attributes
     ----------
-    track : its states, and the turn rate of its gyro; its wheel speeds are as recorded
+    name : name of the log
+    track : states of the run and turn rate of the gyro, with the wheel speeds as recorded
     width_m : track width b
-    path, sha256 : the log's first file; empty where it is not known
-    gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
-    begin_ns : stamp of the first state; 0 where it is not known
-    lever : which parts of the measured point's place on the robot are known
+    path, sha256 : first file of the log; empty if it is not known
+    gyro_reversed : whether the gyro counts turns in the other direction, so that its sign was changed
+    begin_ns : stamp of the first state; 0 if it is not known
+    lever : known parts of the lever to the measured position
     x_clock_std_m : standard deviation of x_icr [m] from the unknown time between position and heading
     wheel_scales : ratios of the left and right speeds of `track` to the speeds that models are fitted to
-    corrected : constants that were corrected in `track` before. Their sum with the constants that are found in `track`
-        gives the constants of the log's sensors
-    heading_source : kind of the heading, as `HeadingFacts.source`; empty where it is not known
+    corrected : constants that were corrected in `track`. The constants of the log's sensors are the sum of these and of
+        the constants that are found in `track`
+    heading_source : source of the heading, as `HeadingFacts.source`; empty if it is not known
     """
 
     name: str
@@ -141,7 +144,7 @@ def totals_of(*recordings: Recording) -> Totals:
 
 
 def size_of(width_m: float) -> float:
-    """Return the part of the usual distances that is used for a robot of track width b [m], at most 1."""
+    """Return the factor of the usual distances for a robot of track width b [m], at most 1."""
     return min(1.0, width_m / FULL_SIZE_WIDTH_M)
 
 
@@ -152,14 +155,14 @@ def cut_windows(
 
     Parameters
     ----------
-    lengths_m : default `WINDOWS_M`, less for small robots
-    pooled : distance and time of all recordings fitted together, default this recording. Larger totals give windows
-        that start further apart, and longer steps
+    lengths_m : lengths of the windows; default: `WINDOWS_M`, shorter for small robots
+    pooled : distance and time of all recordings that are fitted together; default: of this recording. With larger
+        totals windows start further apart, and steps are longer
 
     Raises
     ------
     DataError
-        There are fewer than `FEWEST_FIT_WINDOWS`.
+        There are fewer than `FEWEST_FIT_WINDOWS` windows.
     """
     track, pooled, size = recording.track, pooled or totals_of(recording), size_of(recording.width_m)
     lengths_m = [size * length_m for length_m in WINDOWS_M] if lengths_m is None else lengths_m
@@ -172,9 +175,10 @@ def cut_windows(
 
 
 def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
-    """Return how many wheel samples make a step of the fits; `pooled_s` is the time of all that is fitted together.
+    """Return the number of wheel samples in a step of the fits.
 
-    A step is 0.1 s long. On a long drive it is longer, at most 0.4 s and 0.25 m.
+    A step is 0.1 s long; on a long drive it is longer, at most 0.4 s and 0.25 m. `pooled_s` is the time of all
+    recordings that are fitted together.
     """
     held = recording.track.held
     lasting, travel = held > 0.0, np.empty(len(held))
@@ -199,7 +203,7 @@ def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:
     samples = samples_a_step(recording, pooled_s)
     if samples == 1:
         return recording.wheels()
-    # The samples are joined some at a time, to bound the memory.
+    # The samples are joined in chunks, to bound the memory.
     rows, into = max(ROWS_AT_ONCE // samples, 1) * samples, (samples - 1) / (2.0 * samples)
     parts = []
     for lo in range(0, len(recording.track.t), rows):
@@ -223,8 +227,8 @@ class Trials(NamedTuple):
 
     Attributes
     ----------
-    starts : (k,) states they start from
-    ends : (k, h) states they end at, negative where there is no trial
+    starts : (k,) states at which the trials start
+    ends : (k, h) states at which the trials end; negative for a start without a trial
     """
 
     starts: Ints
@@ -234,15 +238,16 @@ class Trials(NamedTuple):
 def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals | None = None) -> Trials:
     """Return the trials of a recording from states in which it moves.
 
-    Their starts are one step of the fits apart, further on a long drive (about `MOST_TRIALS`): trials that start closer
-    together are nearly equal.
+    Their starts are one step of the fits apart, and further on a long drive (about `MOST_TRIALS` starts), because
+    trials that start closer together are nearly equal.
 
     Parameters
     ----------
-    pooled : distance and time of all recordings fitted together, default this recording
+    horizons_m : (h,) lengths of the trials [m]
+    pooled : distance and time of all recordings that are fitted together; default: of this recording
     """
     track = recording.track
-    # trials that start while the robot stands are nearly equal
+    # Trials that start while the robot stands are nearly equal.
     least = np.diff(track.t)
     least *= TURNING_MPS
     moving = np.flatnonzero(np.diff(track.distance) > least)
@@ -252,14 +257,14 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals
 
 
 class TrialErrors(NamedTuple):
-    """Errors of a model at the ends of trials (k, h), NaN where there is no trial.
+    """Errors of a model at the ends of trials (k, h); NaN without a trial.
 
     Attributes
     ----------
     position : distance between open-loop position and reference [m]
     heading : size of the difference between the open-loop turn and the reference's turn [rad]
-    aligned : as `position`, of the path turned to begin in the direction of the reference's first `ALIGNED_OVER_M`
-        [m]; NaN where a trial is shorter than twice this distance
+    aligned : as `position`, after the path is turned into the direction of the reference's first `ALIGNED_OVER_M` [m];
+        NaN for a trial that is shorter than twice this distance
     """
 
     position: Floats
@@ -273,16 +278,16 @@ class TrialErrors(NamedTuple):
 
 
 ErrorsOf = Callable[[Trials], TrialErrors]
-"""Gives the errors (k, h) of a model in trials."""
+"""Function that returns the errors (k, h) of a model in trials."""
 
 PathAt = Callable[[Floats], tuple[Floats, Complexes]]
-"""Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]. Each
-call computes the whole path."""
+"""Function that returns heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times
+(m,) [s]. Each call computes the whole path."""
 
 
 ALIGNED_OVER_M = 2.0
-"""Distance over which the direction of a path is compared with the reference's [m]. Fixes of 1 cm show it to 0.4°, and
-an error of the turn rate has turned the path little by then."""
+"""Distance over which the directions of a path and of the reference are compared [m]. Fixes of 1 cm show the direction
+to 0.4°, and an error of the turn rate has turned the path only little."""
 
 
 def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> TrialErrors:
@@ -290,11 +295,13 @@ def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> 
 
     Parameters
     ----------
-    start, end : (m,) states
+    recording : the recording of the trials
+    start, end : (m,) states at which the trials start and end
+    path : path of the model
 
     Notes
     -----
-    The parameters are constants, so the path from any start is the same path, turned and shifted. One pass over the
+    The parameters are constant, so the path from any start is the same path, turned and shifted. One pass over the
     samples gives all trials.
     """
     track, first = recording.track, int(start.min())
@@ -307,7 +314,7 @@ def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> 
     s, e, a, off = number[s], number[e], number[a], turned - track.heading[rows]
     turn, reference = np.exp(-1j * off), track.north[rows] + 1j * track.east[rows]
     made, driven = turn[s] * (place[e] - place[s]), reference[e] - reference[s]
-    # a robot that turns back within the first metres shows no direction
+    # A robot that turns back within the first metres shows no direction.
     began, of_reference = turn[s] * (place[a] - place[s]), reference[a] - reference[s]
     shown = np.minimum(np.abs(began), np.abs(of_reference)) > ALIGNED_OVER_M / 2.0
     made_aligned = made * np.where(shown, np.exp(1j * np.angle(of_reference * np.conj(began))), 1.0)
@@ -319,12 +326,12 @@ def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> 
 def predicted_path(
     recording: Recording, fitted: FittedModel, constants: LogConstants = NO_CONSTANTS, steps: Track | None = None
 ) -> PathAt:
-    """Return the path that a model makes of a recording's wheels and gyro, at times of its poses.
+    """Return a function for the path that a model makes of a recording's wheels and gyro, at times of its poses.
 
     Parameters
     ----------
     constants : constants of the recording
-    steps : the wheel samples joined; default single samples, Euler steps as in `icrtool.kernels.open_loop`
+    steps : track with joined wheel samples; default: single samples, in Euler steps as in `icrtool.kernels.open_loop`
 
     Notes
     -----
@@ -334,6 +341,7 @@ def predicted_path(
     driven = steps if steps is not None else recording.track
 
     def twists(rows: slice) -> tuple[Floats, Ints, Floats]:
+        """Return the twist of some steps, which has no free terms."""
         wheels = recording.wheels(rows) if steps is None else steps.wheels(rows)
         gyro = wheels.gyro
         if gyro is not None and constants.gyro_later_s:
@@ -344,6 +352,7 @@ def predicted_path(
         return moving, np.empty(0, np.int64), np.empty((0, len(motion.v)))
 
     def at_times(at: Floats) -> tuple[Floats, Complexes]:
+        """Return heading and place of the path at times of poses."""
         path = path_at(driven, twists, np.empty(0), at + constants.wheels_later_s)
         return path.heading - constants.heading_offset_rad, path.place
 
@@ -351,22 +360,21 @@ def predicted_path(
 
 
 TURN_S = 1.0
-"""Time over which turns are compared [s]."""
+"""Time over which the turns of a gyro and of the reference are compared [s]."""
 
 FEWEST_TURNS = 10
-"""Number of turns below which a gyro is not compared."""
+"""Smallest number of turns for a comparison of a gyro."""
 
 GYRO_PRIOR_STD = np.array([10.0, 0.005, 0.2])
-"""Prior standard deviations of a gyro's scale, bias [rad/s] and lead [s]. The scale's is wide because its sign is
-unknown. On a circle only the prior separates scale and bias."""
+"""Prior standard deviations of a gyro's scale, bias [rad/s] and lead [s]. The prior of the scale is wide, because its
+sign is not known. On a circle, only the prior separates scale and bias."""
 
 GYRO_SCALE_RANGE = 0.1
-"""Largest difference between a gyro's turn and the reference's turn, as a share. Beyond it the gyro does not measure
-the robot's yaw."""
+"""Largest difference between the scale of a gyro and 1 or -1. Beyond it, the gyro does not measure the robot's yaw."""
 
 
 class GyroLine(NamedTuple):
-    """Scale, bias [rad/s] and lead [s] of a gyro; NaN, and no lead, where too few turns show them."""
+    """Scale, bias [rad/s] and lead [s] of a gyro; if too few turns show them, NaN and no lead."""
 
     scale: float
     bias_radps: float
@@ -379,7 +387,7 @@ class GyroLine(NamedTuple):
 
 
 def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: Floats) -> GyroLine:
-    """Return the line that maps the turns of a gyro to the turns of the reference over `TURN_S`.
+    """Return scale, bias and lead that map the turns of a gyro over `TURN_S` to the turns of the reference.
 
     Parameters
     ----------
@@ -405,38 +413,38 @@ GYRO_START_STD = (0.02, 0.005)
 `GYRO_PRIOR_STD`."""
 
 SMALLEST_SCALE_STD = 1e-6
-"""Standard deviation of a scale that is known. A turn of 1000 rad shows less than this."""
+"""Standard deviation of a known scale. A turn of 1000 rad does not show it."""
 
 TURN_NOISE_RAD = 0.01
-"""Spread of the differences of turns over `TURN_S` that is assumed before a drive [rad]."""
+"""Assumed standard deviation of the differences of turns over `TURN_S` before a drive [rad]."""
 
 GUESSED_TURNS = 5
-"""Number of measured differences that the assumed spread counts as."""
+"""Number of measured differences that the assumed standard deviation counts as."""
 
 MISSED_TURN_SHARE = 0.05
-"""Standard deviation of a difference of turns that grows with the turn, as a share of it. It is added to the spread,
-because lags and slip differ from turn to turn.
+"""Standard deviation of a difference of turns by lags and slip, which differ from turn to turn, as a share of the turn.
 
-Without it the spread of a robot that stands at first is too small, and one turn moves the scale by 6 % (a recorded
-Warthog on asphalt)."""
+Without this part, the standard deviation of a robot that stands at first is too small, and one turn changes the scale
+by 6 % (a recorded Warthog on asphalt)."""
 
 MEAN_TO_STD = 1.2533
 """Ratio of the standard deviation of normal values to their mean size."""
 
 MOST_SIGMAS = 3.0
-"""Size of a difference of turns, in standard deviations, to which larger differences are limited in the spread."""
+"""Size of a difference of turns, in standard deviations, to which larger differences are limited."""
 
 RENEWED_S = 10.0
-"""Time between two lines of a gyro [s]. Scale and bias change slowly; in the first seconds of a drive the lines follow
-more often."""
+"""Time between two lines of a gyro [s], because scale and bias change slowly. In the first seconds of a drive there are
+more lines."""
 
 
 class PastLines(NamedTuple):
-    """Lines of a gyro; each holds from one state on, and comes from turns that ended before this state.
+    """Lines (scale and bias) of a gyro. Each holds from a state on, and comes from turns that ended before this state.
 
     Attributes
     ----------
-    row : (k,) first state of each, from 0 on; scale (k,); bias_radps (k,)
+    row : (k,) state from which each line holds; the first is 0
+    scale, bias_radps : (k,) scale and bias
     """
 
     row: Ints
@@ -445,18 +453,19 @@ class PastLines(NamedTuple):
 
 
 def past_gyro_lines(track: Track) -> PastLines:
-    """Return scale and bias of a track's gyro as known from the past of each state, without its lead."""
+    """Return the lines of a track's gyro that are known from the past of each state."""
     turned = np.zeros(len(track.t)) if track.gyro is None else track.cumulate(track.gyro)
     return past_lines(track, lambda rows: turned[rows], GYRO_START_STD)
 
 
 def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tuple[float, float]) -> PastLines:
-    """Return the lines from measured turns to the reference's turns, as known from the past of each state.
+    """Return the lines that map measured turns to the turns of the reference, as known from the past of each state.
 
     Parameters
     ----------
-    turned_at : gives how far something has turned at some states [rad], from any angle
-    before_std : standard deviations of scale and bias [rad/s] before the drive, about 1 and 0; with 0 the scale is 1
+    track : track with the reference
+    turned_at : returns the measured angle at some states [rad], from any origin
+    before_std : standard deviations of scale and bias [rad/s] before the drive, about 1 and 0; for 0 the scale is 1
 
     Notes
     -----
@@ -470,7 +479,7 @@ def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tu
         begins.append(begins[-1] + min(max(begins[-1], TURN_S), RENEWED_S))
     rows = np.searchsorted(t, begins[: max(len(begins) - 1, 1)])
     made = [np.diff(column).tolist() for column in (turned_at(every), lasted[every], track.heading[every])]
-    # Information matrix of scale - 1 and bias, and information times mean.
+    # These are the information matrix of scale - 1 and bias, and the product of information and mean.
     a, b, c = max(before_std[0], SMALLEST_SCALE_STD) ** -2.0, 0.0, before_std[1] ** -2.0
     p = q = scale = bias = 0.0
     count, sizes, done = GUESSED_TURNS, GUESSED_TURNS * TURN_NOISE_RAD / MEAN_TO_STD, 0

@@ -26,17 +26,17 @@ OTHER_ROBOTS = "other robots"
 
 @functools.cache
 def known_robots() -> dict[str, dict[str, float | str]]:
-    """Return the terms of robots by name, and their ``source``."""
+    """Return the terms and the ``source`` of each known robot by name."""
     return tomllib.loads(resources.files("icrtool").joinpath("robot_terms.toml").read_text(encoding="utf-8"))
 
 
 def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
-    """Return the prior of a robot of which only the track width b is known.
+    """Return the prior of a robot of which only the track width is known.
 
     Parameters
     ----------
-    track_width_m : b [m]
-    without : name of a robot to leave out, to test the prior on it
+    track_width_m : track width b
+    without : name of a robot that is left out, to test the prior on it
 
     Notes
     -----
@@ -56,11 +56,14 @@ def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
 
 
 def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedModel | None, source: str) -> TermsPrior:
-    """Return the prior that fitted models of a robot give for its next drive.
+    """Return the prior for the next drive of a robot from its fitted models.
 
     Parameters
     ----------
-    fitted, turned : models with wheels alone, and with a gyro; terms that both lack have the prior of `prior_of_robots`
+    track_width_m : track width b
+    fitted, turned : models with wheels alone, and with a gyro; None: without one. Terms that both lack have the prior
+        of `prior_of_robots`
+    source : source of the prior, in a few words
 
     Notes
     -----
@@ -78,7 +81,7 @@ def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedMode
 def _placed(
     terms: tuple[str, ...], mean: Floats, covariance: Floats, fitted: FittedModel
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    """Return mean and covariance of terms: terms of the fitted model for a further drive, other terms unchanged."""
+    """Return mean and covariance of terms; the terms of a fitted model get their prior for a further drive."""
     names = fitted.model.terms
     of_fit = [names.index(name) for name in terms if name in names]
     at = [terms.index(name) for name in terms if name in names]

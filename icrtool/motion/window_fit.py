@@ -4,8 +4,8 @@ Heading, place and their derivatives are sums over the wheel samples, so one pas
 all its windows (`icrtool.kernels.window_residuals`). To leave a fold out, its part is subtracted from the normal
 equations, so one fit gives the solutions of all folds.
 
-Each recording has constants of its own, which are not part of a calibration (`icrtool.motion.recording.LogConstants`).
-With several recordings, the constants are eliminated from each recording's normal equations
+Each recording has its own constants, which are not part of a calibration (`icrtool.motion.recording.LogConstants`). If
+there are several recordings, the constants are eliminated from the normal equations of each recording
 (`icrtool.kernels.elimination`).
 """
 
@@ -37,38 +37,38 @@ from icrtool.motion.models import FittedModel, MotionModel, WheelMotion, model_c
 from icrtool.motion.recording import STRETCH_M, LogConstants, size_of
 
 LAST_DELAY_STEP_SIGMAS = 0.1
-"""Largest last step of a delay, in its standard deviations. The residuals have kinks over the delay, where a shorter
-step is not reached."""
+"""Length of a step of a delay below which it is the last step, in standard deviations. The residuals have kinks over
+the delay, so that steps do not become shorter."""
 
 REWEIGHTS = 2
 """Number of reweighted steps of a fit without a fold."""
 
 FEWEST_TO_SUBTRACT = 4
-"""Number of recordings from which on one of them is subtracted from the fit of all. With fewer, the others are fitted
-anew, because one recording is a large part of all."""
+"""Smallest number of recordings for which one is subtracted from the fit of all. Of fewer recordings, the others are
+fitted anew, because one recording is then a large part of all."""
 
 
 CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
-"""Prior standard deviations of `LogConstants` about zero [rad, s, rad/s, s]: the heading was aligned before, and the
-clocks and the gyro belong to one robot."""
+"""Prior standard deviations of `LogConstants` about zero [rad, s, rad/s, s]. The heading was aligned before, and clocks
+and gyro belong to one robot."""
 
 CONSTANTS_OF_WHEELS = 2
-"""Number of constants, at the start of `LogConstants`, that a recording without a gyro has."""
+"""Number of constants of a recording without a gyro. They come first in `LogConstants`."""
 
 RESIDUAL_KINDS = (0, 0, 1)
-"""Kind of each residual of a window: forward and right have a common spread, the turn has its own."""
+"""Kind of each residual of a window. Forward and right have a common standard deviation, and the turn has its own."""
 
 FEWEST_RESIDUALS = 10 * len(RESIDUAL_KINDS)
-"""Number of residuals outside a fold below which no parameters are computed."""
+"""Smallest number of residuals outside of a fold from which parameters are computed."""
 
 
 def constant_std(model: MotionModel) -> Floats:
-    """Return the prior standard deviations of a recording's constants that the model uses."""
+    """Return the prior standard deviations (c,) of the constants that a model uses."""
     return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:CONSTANTS_OF_WHEELS]
 
 
 def heading_wander(turned: Floats, length_m: Floats) -> float:
-    """Return the growth of a heading's variance by slip per metre [rad^2/m]; 0 for windows of one length.
+    """Return the growth of the variance of a heading by slip for each metre [rad^2/m]; 0 for windows of one length.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ def heading_wander(turned: Floats, length_m: Floats) -> float:
 
     Notes
     -----
-    The growth is the increase of the variance from short to long windows. The part that both have is the reference's
-    noise.
+    The growth is the increase of the variance from short to long windows. The part that both have in common is the
+    noise of the reference.
     """
     short, long = float(length_m.min()), float(length_m.max())
     if short == long:
@@ -87,45 +87,47 @@ def heading_wander(turned: Floats, length_m: Floats) -> float:
 
 
 def shortening_by_wander(wander: float, length_m: Floats) -> Floats:
-    """Return the mean ratio (w,) of a window's displacement to its value without wander of the heading.
+    """Return the mean ratio (w,) of a window's displacement to its displacement without wander of the heading.
 
     Parameters
     ----------
-    wander : of `heading_wander` [rad^2/m]; length_m : (w,) of the windows
+    wander : result of `heading_wander` [rad^2/m]; length_m : (w,) lengths of the windows
 
     Notes
     -----
-    A heading that wanders with a variance of q for each metre leaves the mean of e^{j Theta} short by q s / 2 after s
-    metres: a displacement over L by q L / 4, to first order. Without this ratio, the scale of the wheels and the
-    multiplier would be too small.
+    If the variance of a heading grows by q for each metre, the mean of e^{j Theta} decreases by q s / 2 after s metres,
+    and the displacement over a length L by a share of q L / 4, to first order. Without this ratio, the scale of the
+    wheels and the multiplier would be too small.
     """
     return np.asarray(np.exp(-wander * length_m / 4.0))
 
 
 Residuals = Callable[[Floats, Floats], tuple[Floats, Floats]]
-"""Gives residuals (m,) and their derivatives (m, k + c), of parameters (k,) and constants (c,)."""
+"""Function that returns residuals (m,) and their derivatives (m, k + c) for parameters (k,) and constants (c,)."""
 
 
 def residuals_of(
     windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None,
     wander: float | None = None,
 ) -> Residuals:  # fmt: skip
-    """Return a function that gives the residuals of all windows of one recording for one model, over sqrt(length).
+    """Return a function for the residuals of all windows of a recording by a model, divided by sqrt(length).
 
     Displacements alone do not separate a turn from side slip, and show little of a spin on the spot. Therefore turns
-    are residuals, too, weighted by their own spread.
+    are residuals, too, weighted by their own standard deviation.
 
     Parameters
     ----------
-    windows : of `icrtool.motion.recording.cut_windows`
+    windows : result of `icrtool.motion.recording.cut_windows`
     model, width_m : the model, and the track width b [m]
-    wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
-    wander : of `heading_wander`, where it is known [rad^2/m]; default: computed from these windows
+    wheels : for a model with a gyro, the wheels-only model whose turn rate is combined with the turn rate of the gyro
+    wander : result of `heading_wander`, if it is known [rad^2/m]; default: it is computed from these windows
 
     Returns
     -------
-    A function of parameters (k,) and constants (c,), `LogConstants`; constants of a gyro only for a model with a gyro.
-    It returns residuals (3 w,), forward, right [m^0.5], then turn [rad/m^0.5], and their derivatives (3 w, k + c).
+    Residuals
+        Function of parameters (k,) and constants (c,) as in `LogConstants`, with constants of a gyro only for a model
+        with a gyro. It returns residuals (3 w,), forward, right [m^0.5], then turn [rad/m^0.5], and their derivatives
+        (3 w, k + c).
     """
     steps, root = windows.track, np.sqrt(windows.length_m)
     seen, seen_turned = windows.moved, windows.turned
@@ -141,7 +143,7 @@ def residuals_of(
         strayed = heading_wander(turned * root, windows.length_m) if wander is None else wander
         share = shortening_by_wander(strayed, windows.length_m)
         moved, moved_by = window_residuals(path, start, end, seen, offset, root, share)
-        # from the order terms, gyro columns, offset, delay to the order terms, `LogConstants`
+        # The derivatives are reordered from terms, gyro columns, offset, delay to terms, `LogConstants`.
         k, terms = len(parameters), len(axes)
         jacobian = np.concatenate([moved_by, turned_by])[:, [*range(k), terms, terms + 1, *range(k, terms)]]
         return np.concatenate([moved, turned]), jacobian
@@ -150,7 +152,7 @@ def residuals_of(
 
 
 class StepColumns(NamedTuple):
-    """Twists of a path at each of n steps, with p free terms: k of the model, and the terms of the gyro's constants.
+    """Twists of a path at n steps, with p free terms: the k terms of the model, and terms of the gyro's constants.
 
     Attributes
     ----------
@@ -167,11 +169,12 @@ class StepColumns(NamedTuple):
 def step_columns(
     steps: Track, motion: WheelMotion, model: MotionModel, wheels: FittedModel | None = None
 ) -> Callable[[Floats, Floats], StepColumns]:
-    """Return a function that gives the columns of a track's steps for parameters (k,) and constants (c,).
+    """Return a function for the columns of a track's steps, for parameters (k,) and constants (c,).
 
     Parameters
     ----------
-    motion : of the steps, with their gyro
+    steps : track with joined wheel samples
+    motion : motion of the wheels in the steps, with their gyro
     model, wheels : as in `residuals_of`
     """
     if wheels is not None:
@@ -180,10 +183,10 @@ def step_columns(
     if not model.uses_gyro:
         return lambda parameters, _: StepColumns(of_model, axes, of_terms, parameters)
     k, gyro_change = len(axes), steps.gyro_change()
-    # the gyro's bias and time are two more columns of the turn rate
+    # The bias and the time of the gyro are two further columns of the turn rate.
     axes = np.append(axes, [OMEGA, OMEGA])
     of_terms = np.concatenate([of_terms, np.ones((2, len(steps.t)))])
-    # derivative of the gyro's weight in the turn rate by each parameter
+    # These are the derivatives of the weight of the gyro in the turn rate by each parameter.
     gains = np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
 
     def columns_at(parameters: Floats, constants: Floats) -> StepColumns:
@@ -198,12 +201,13 @@ def step_columns(
 
 
 class Fold(NamedTuple):
-    """Data that are left out together: a recording, or a block of distance of a single one.
+    """Data that are left out together: a recording, or a part of a single recording.
 
     Attributes
     ----------
-    name : of the recording, or of the block of distance in which it begins; number : the same, counted from 0
-    recording : which one; begin_m, end_m : path lengths [m], infinite for all of it
+    name, number : name and number, from 0, of the recording, or of the block of distance in which the fold begins
+    recording : number of the recording
+    begin_m, end_m : path lengths at begin and end [m]; infinite for a whole recording
     """
 
     name: str
@@ -214,7 +218,7 @@ class Fold(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether all of the recording is left out."""
+        """Whether the fold is a whole recording."""
         return bool(np.isinf(self.begin_m) and np.isinf(self.end_m))
 
 
@@ -230,9 +234,9 @@ class PooledFit(FittedModel):
     ----------
     wheels : as in `FittedModel`, fitted to the same windows
     pool : the windows
-    wide : fit of the model with wide priors, which gave the priors of this fit; None where no term has a wide prior
-    solution : all parameters: first the model's, then the constants of each recording. Constants of several recordings
-        were eliminated; constants of a single recording were fitted like the model's parameters.
+    wide : fit of the model with wide priors, from which the priors of this fit follow; None if no term has a wide prior
+    solution : all parameters: first of the model, then the constants of each recording. Constants of several recordings
+        were eliminated; constants of a single recording were fitted like the parameters of the model
     """
 
     wheels: PooledFit | None = None
@@ -249,7 +253,7 @@ class PooledFit(FittedModel):
         return FittedModel(self.model, self.parameters, self.covariance, wheels)
 
     def with_clock_error(self, x_std_m: float) -> PooledFit:
-        """Return the fit with a further standard deviation of its x_icr [m], -vy_w b / (2 omega_w)."""
+        """Return the fit with a further standard deviation of its x_icr [m], which is -vy_w b / (2 omega_w)."""
         by_term = dict(zip(self.model.terms, self.parameters.tolist(), strict=True))
         place, covariance = self.model.terms.index("vy_w"), self.covariance.copy()
         covariance[place, place] += (2.0 * by_term["omega_w"] / self.pool.widths_m[0] * x_std_m) ** 2
@@ -260,6 +264,7 @@ class PooledFit(FittedModel):
         return LogConstants(*self._own(self.solution.x, recording).tolist())
 
     def _own(self, x: Floats, recording: int) -> Floats:
+        """Return the constants (c,) of a recording in all parameters x."""
         constant_count = len(constant_std(self.model))
         first = len(self.parameters) + constant_count * recording
         return x[first : first + constant_count]
@@ -267,16 +272,15 @@ class PooledFit(FittedModel):
     def without(self, fold: Fold) -> Prediction | None:
         """Return the model fitted without a fold, and the constants of the fold's recording for this model.
 
-        Returns
-        -------
-        None where too little is left. The constants of a recording that is left out whole are estimated in it; with
-        many recordings, to first order of the parameters' change.
+        None if too few residuals are left. The constants of a whole recording are estimated in this recording; with
+        many recordings, to first order in the change of the parameters.
         """
         if fold not in self._left_out:
             self._left_out[fold] = self._fit_without(fold)
         return self._left_out[fold]
 
     def _fit_without(self, fold: Fold) -> Prediction | None:
+        """Return the result of `without`, which is kept."""
         pool, i, k = self.pool, fold.recording, len(self.parameters)
         clear = pool.clear_of(fold)
         if np.count_nonzero(clear) < FEWEST_RESIDUALS:
@@ -292,12 +296,12 @@ class PooledFit(FittedModel):
         model = self.model if shown is None else replace(self.model, stds=()).as_shown(shown[0])
         if fold.whole:
             gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
-            # without the recording the priors may differ
+            # The priors may be different without the recording.
             pull = model.prior_std**-2.0 - self.model.prior_std**-2.0
             gradient, curvature = gradient - pull * (self.parameters - model.prior_mean), curvature - np.diag(pull)
             covariance = self._covariance(np.linalg.inv(self.curvature - curvature))
-            # a Newton step: at the minimum the gradients of all residuals and of the prior sum to zero, so the gradient
-            # without the fold is minus the fold's gradient
+            # This is a Newton step. At the minimum the gradients of all residuals and of the prior sum to zero, so the
+            # gradient without the fold is the negative gradient of the fold.
             steps = np.linalg.solve(self.curvature - curvature, gradient)
             fitted = FittedModel(model, self.parameters + steps, covariance, wheels)
             constants = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
@@ -313,16 +317,17 @@ class PooledFit(FittedModel):
         return self._refits[recording]
 
     def _reweighted(self, clear: Bools, model: MotionModel) -> tuple[Floats, Floats]:
-        """Return all parameters of a single recording, fitted to some residuals (m,), and the model's covariance.
+        """Return all parameters of a single recording, fitted to some residuals, and the covariance of the model.
 
         Parameters
         ----------
-        model : with its priors
+        clear : (m,) residuals that are used
+        model : the model with its priors
 
         Notes
         -----
-        A Newton step, then two reweighted steps of a new fit. Residuals are linear in the parameters; over some metres
-        this is nearly exact.
+        A Newton step, then two reweighted steps of a new fit. The residuals are linearised, which is nearly exact over
+        some metres.
         """
         at, (mean, std), pool = self.solution, self.pool.prior(model), self.pool
         residuals, jacobian, pull = at.residuals[clear], at.jacobian[clear], std**-2.0
@@ -346,14 +351,14 @@ class PooledFit(FittedModel):
 
         Notes
         -----
-        The ratio of a parameter's variance to its variance with independent residuals is kept as with the recording.
+        The ratio of a parameter's variance to its variance for independent residuals is the same as with the recording.
         """
         grown = np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(self.curvature)))
         return np.asarray(inverse * np.outer(grown, grown), np.float64)
 
     @cached_property
     def _by_recording(self) -> tuple[Floats, Floats]:
-        """Gradient and curvature of each recording, its constants eliminated; (r, k), (r, k, k)."""
+        """Gradient (r, k) and curvature (r, k, k) of each recording, with its constants eliminated."""
         at = self.solution
         both = [self._derivatives(self.pool.rows(i)) for i in range(len(self.pool.windows))]
         gradients, curvatures = (np.array(column) for column in zip(*both, strict=True))
@@ -361,7 +366,7 @@ class PooledFit(FittedModel):
 
     @cached_property
     def curvature(self) -> Floats:
-        """Second derivatives of the loss and the prior together (k, k)."""
+        """Second derivatives (k, k) of the sum of loss and prior."""
         prior = self.pool.prior(self.model)[1][: len(self.solution.prior)] ** -2.0
         return np.asarray(self._by_recording[1].sum(axis=0) + np.diag(prior), np.float64)
 
@@ -370,19 +375,19 @@ class PooledFit(FittedModel):
         at = self.solution
         residuals, jacobian, scale = at.residuals[rows], at.jacobian[rows], at.scale[rows]
         weights = robust_weights(residuals, scale, self.pool.overlap)
-        # the second derivative of soft L1 is the cube of its weight
+        # The second derivative of soft L1 is the cube of its weight.
         curvature, _ = normal_equations(residuals, jacobian, weights * soft_l1_weights(residuals / scale) ** 2)
         return jacobian.T @ (weights * residuals), curvature
 
 
 class KnownConstants(NamedTuple):
-    """Constants of a recording with their standard deviations; NaN where they are not known."""
+    """Constants of a recording with their standard deviations; NaN for a constant that is not known."""
 
     mean: LogConstants
     std: LogConstants
 
     def usual(self) -> KnownConstants:
-        """Return the constants; unknown constants get the prior of a drive, `CONSTANT_STD` about zero."""
+        """Return the constants; an unknown constant becomes the prior of a drive, `CONSTANT_STD` about zero."""
         both = zip(self.mean, self.std, UNKNOWN_CONSTANTS.std, strict=True)
         pairs = [(mean, std) if np.isfinite(mean) else (0.0, usual) for mean, std, usual in both]
         mean, std = zip(*pairs, strict=True)
@@ -390,7 +395,7 @@ class KnownConstants(NamedTuple):
 
 
 UNKNOWN_CONSTANTS = KnownConstants(LogConstants(), LogConstants(*CONSTANT_STD.tolist()))
-"""Constants of a drive of which only the usual spread is known."""
+"""Constants of a drive of which only the prior is known."""
 
 
 def own_constants(
@@ -400,7 +405,9 @@ def own_constants(
 
     Parameters
     ----------
-    held : constants that keep their values; constants that are NaN are estimated. Default: all are estimated
+    windows : windows of the recording
+    fitted, width_m : the model, and the track width b [m]
+    held : constants that keep their values; a constant that is NaN is estimated. Default: all are estimated
     """
     held_values = np.full(len(constant_std(fitted.model)), np.nan)
     if held is not None:
@@ -415,8 +422,8 @@ def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) ->
 
     Notes
     -----
-    Stretches of `STRETCH_M` are independent, as in the covariance of parameters. The parameters' own covariance is not
-    part of the deviations: constants are used with the parameters that they were measured with.
+    Stretches of `STRETCH_M` count as independent, as in the covariance of parameters. The covariance of the parameters
+    is not part of the standard deviations, because constants are used with the parameters they were measured with.
     """
     pool = Pool([windows], [width_m])
     unknown = np.full(len(constant_std(fitted.model)), np.nan)
@@ -429,7 +436,7 @@ def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) ->
 def _fit_constants(
     windows: Windows, fitted: FittedModel, width_m: float, known: Floats, overlap: float
 ) -> tuple[Floats, RobustFit]:
-    """Return all constants (c,), and the fit of the constants that are NaN in `known` (c,)."""
+    """Return all constants (c,), and the fit of those that are NaN in `known` (c,); `overlap` as in `Linearised`."""
     of_both, free = residuals_of(windows, fitted.model, width_m, fitted.wheels), np.isnan(known)
     std = constant_std(fitted.model)[free]
 
@@ -456,10 +463,10 @@ class Pool:
 
     Attributes
     ----------
-    recording, start_m, end_m, length_m : (m,) of the window of each residual
-    first : (recordings + 1,) first residual of each, and the number of all
-    kind : (m,) of `RESIDUAL_KINDS`
-    group : (m,) stretches of distance whose residuals depend on one another
+    recording, start_m, end_m, length_m : (m,) recording, begin, end and length of the window of each residual
+    first : (recordings + 1,) first residual of each recording, and the number of all residuals
+    kind : (m,) kind of each residual (`RESIDUAL_KINDS`)
+    group : (m,) stretch of distance of each residual; residuals of one stretch depend on each other
     overlap : mean number of windows that cover a place
     """
 
@@ -479,7 +486,7 @@ class Pool:
         self.overlap = max(float(self.length_m.sum()) / len(RESIDUAL_KINDS) / covered_m, 1.0)
 
     def prior(self, model: MotionModel) -> tuple[Floats, Floats]:
-        """Return mean and standard deviation of all parameters, model first, then the constants of each recording."""
+        """Return prior mean and standard deviation of all parameters: of the model, then constants of each recording."""
         constants_std = np.tile(constant_std(model), len(self.windows))
         mean = np.concatenate([model.prior_mean, np.zeros(len(constants_std))])
         return mean, np.concatenate([model.prior_std, constants_std])
@@ -490,7 +497,7 @@ class Pool:
         return Pool([self.windows[i] for i in others], [self.widths_m[i] for i in others])
 
     def rows(self, recording: int) -> slice:
-        """Return where the residuals of a recording are."""
+        """Return the rows of the residuals of a recording."""
         return slice(self.first[recording], self.first[recording + 1])
 
     def clear_of(self, fold: Fold) -> Bools:
@@ -503,11 +510,12 @@ class Pool:
 
         Parameters
         ----------
-        wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
+        wheels : for a model with a gyro, the wheels-only model whose turn rate is combined with the turn rate of the
+            gyro
 
         Notes
         -----
-        The priors of some terms are as wide as these windows show them (`MotionModel.as_shown`).
+        The priors of some terms become wider if these windows show the terms (`MotionModel.as_shown`).
         """
         widened, wide = model.widened(), None
         if widened is not None:
