@@ -1,8 +1,8 @@
 """The ICR EKF and its smoother, compiled (Pentzer 2014, Section 3, Eqs. 13-25; Rauch, Tung, Striebel 1965).
 
 The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
-`filter_events` is the one event loop: the filter and the smoother's forward pass call it. The tests compare the filter
-with a filter in matrix form (tests/support/matrix_filter.py), which is easier to read first.
+`filter_events` is the only event loop: the filter and the forward pass of the smoother call it. The tests compare the
+filter with a filter in matrix form (tests/support/matrix_filter.py), which is easier to read first.
 
 The smoother runs the filter again and keeps a node for every event: the predicted state, and the state after the
 updates. Backwards, with F of Eqs. 17, 27-29 between node i and the next,
@@ -41,14 +41,14 @@ from icrtool.kernels.kalman import correct, propagate, smooth_passes, store
 from icrtool.kernels.kinematics import step_jacobian, wheel_speed
 
 NORTH, EAST, PSI = (cast(int, np.int64(axis)) for axis in range(3))
-"""Rows of the state that are measured. They are typed, because numba compiles a further copy of a function for every
-plain number in a call."""
+"""Rows of the state that are measured. They are numbers of a NumPy type, because numba compiles a copy of a function
+for each plain number in a call."""
 
 CHANGE, FIX, HEADING, WHEELS = range(4)
-"""Kinds of events, in their order at equal stamps: terrain changes, fixes, headings, wheel samples."""
+"""Kinds of events, in their order at equal stamps: terrain change, fix, heading, wheel sample."""
 
 BLOCK_EVENTS = 200_000
-"""Number of events in one compiled call of `run_ekf`. A call takes some 0.03 s; Ctrl-C and SIGTERM act between
+"""Number of events in one compiled call of `run_ekf`. A call takes about 0.03 s; Ctrl-C and SIGTERM act between
 calls."""
 
 
@@ -62,11 +62,15 @@ def wrap(angle: float) -> float:
 
 @njit_part
 def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, parameters: FilterParameters) -> bool:
-    """Remember a rejected innovation; return whether the rejected ones agree, so that the filter must be wrong.
+    """Store a rejected innovation; return whether the rejected innovations agree, so that the filter must be wrong.
 
-    Wrong fixes disagree with one another; a filter that is wrong sees the same innovation again and again.
-    `run` (4,) holds count, time of the first, and the last innovation; `limit` is the squared difference that two
-    consecutive innovations of a run may have.
+    Wrong fixes disagree with each other, and a wrong filter has the same innovation again and again.
+
+    Parameters
+    ----------
+    run : (4,) number of agreeing innovations, time of the first one [s], and the last innovation
+    t : time of the innovation [s]; nu_n, nu_e : the innovation
+    limit : largest squared difference of two consecutive innovations that agree
     """
     step_n, step_e = nu_n - run[2], nu_e - run[3]
     if run[0] > 0.0 and step_n * step_n + step_e * step_e <= limit:
@@ -83,7 +87,7 @@ def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, 
 def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
     """Return the antenna's position relative to the body origin: a = R(psi) (forward, right), north and east [m].
 
-    h(x) = (N, E) + a, so dh/dpsi = (-a_E, a_N); without a lever arm H is Eq. 22.
+    h(x) = (N, E) + a, so dh/dpsi = (-a_E, a_N). Without a lever arm, H is Eq. 22.
     """
     c, s = math.cos(x[2]), math.sin(x[2])
     return forward * c - right * s, forward * s + right * c
@@ -91,7 +95,7 @@ def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
 
 @njit_part
 def measured_column(P: Floats, axis: int, h_psi: float, PH: Floats) -> float:
-    """Fill PH (6,) = P H^T and return H P H^T, for H = e_axis + h_psi e_psi; of the heading with h_psi 0."""
+    """Fill PH (6,) with P H^T and return H P H^T, for H = e_axis + h_psi e_psi; h_psi is 0 for a heading."""
     for i in range(6):
         PH[i] = P[i, axis] + h_psi * P[i, 2]
     return float(PH[axis] + h_psi * PH[2])
@@ -101,8 +105,8 @@ def measured_column(P: Floats, axis: int, h_psi: float, PH: Floats) -> float:
 def keep_sides(x: Floats, P: Floats, least: float) -> None:
     """Move the state to the nearest one, in the metric of P, with y_icr_right >= least and y_icr_left <= -least.
 
-    The right track is to the right of the left one: the paper's guard (Section 5.1) applied to the states, too.
-    Estimate projection (Simon and Chia 2002): the covariance stays as it is.
+    The right track is right of the left track: the guard of Pentzer 2014 (Section 5.1), applied to the states. Estimate
+    projection (Simon and Chia 2002); the covariance does not change.
     """
     for turn in range(4):
         place = 3 + turn % 2
@@ -117,10 +121,11 @@ def keep_sides(x: Floats, P: Floats, least: float) -> None:
 def take_fix(
     data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, out: FilterOutput
 ) -> tuple[float, float, float]:
-    """Gate and apply a fix, and fill its row of the output; return the variances (3,) added to P before the update.
+    """Gate and apply a fix, and fill its row of the output; return the variances (3,) that it added to P.
 
-    A fix that ends a lock-out adds its squared innovation to the variances of north and east [m^2]; others add 0.
-    North and east are applied one after the other, which equals the joint update since their noises are independent.
+    A fix that ends a lock-out adds its squared innovation to the variances of north and east [m^2] before the update;
+    other fixes add 0. North and east are applied one after the other, which equals the joint update, because their
+    noises are independent.
     """
     x, P, run = state.x, state.P, state.rejected[0]
     z_n, z_e, r_n, r_e = data.gnss_z[row, 0], data.gnss_z[row, 1], data.gnss_r[row, 0], data.gnss_r[row, 1]
@@ -157,10 +162,10 @@ def take_fix(
 def take_heading(
     data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, out: FilterOutput
 ) -> tuple[float, float, float]:
-    """Gate and apply a heading, and fill its row of the output; return the variances (3,) added to P before the update.
+    """Gate and apply a heading, and fill its row of the output; return the variances (3,) that it added to P.
 
-    The gate tests this sample alone (variance r). The update uses variance r times the correlation, because the errors
-    of neighbouring samples are not independent.
+    The gate tests the single sample, with variance r. The update uses r times the correlation, because the errors of
+    consecutive samples are not independent.
     """
     x, P, run, r = state.x, state.P, state.rejected[1], data.heading_r[row]
     nu = wrap(data.heading_z[row] - x[2])
@@ -185,15 +190,15 @@ def take_heading(
 def advance(
     dt: float, data: FilterInputs, k: int, state: FilterState, parameters: FilterParameters, space: Space
 ) -> None:
-    """Propagate by dt [s] (Eqs. 14, 16) and add the process noise and the path length by the wheels.
+    """Propagate the state by dt [s] (Eqs. 14, 16), and add process noise and path length.
 
-    Through a gap in the wheel data, and through slip, the pose is not dead-reckoned: only its uncertainty grows, and
-    the next measurement does not change the ICRs; ``space.G`` becomes 0. The variance of the ICRs grows with the
-    distance that the wheels travel, in a gap too: the ICRs of a parked robot keep their variance.
+    Through a gap in the wheel data, and through slip, the pose is not dead-reckoned: ``space.G`` becomes 0, only the
+    uncertainty of the pose grows, and the next measurement does not change the ICRs. The variance of the ICRs grows
+    with the distance that the wheels travel, also in a gap, so that the ICRs of a parked robot keep their variance.
 
     Parameters
     ----------
-    k : next wheel sample; until its stamp the speeds of sample k - 1 hold
+    k : next wheel sample; until its stamp, the speeds of sample k - 1 hold
     """
     x, P, G, held = state.x, state.P, space.G, max(k - 1, 0)
     v_left, v_right = data.v_left[held], data.v_right[held]
@@ -225,7 +230,7 @@ def advance(
 
 @njit_part
 def begin_node(nodes: Nodes, m: int, state: FilterState, dt: float, G: Floats) -> None:
-    """Store in node m the state that is predicted there, dt [s] after the node before."""
+    """Store in node m the predicted state, dt [s] after the node before."""
     store(state.x, state.P, nodes.x_predicted, nodes.P_predicted, m)
     for i in range(3):
         for j in range(4):
@@ -243,7 +248,7 @@ def end_node(nodes: Nodes, m: int, state: FilterState, row: int, more: tuple[flo
 
 @njit_part
 def record(state: FilterState, states: Floats, column: int) -> None:
-    """Fill a column of `FilterOutput.states`."""
+    """Store the state in a column of `FilterOutput.states`."""
     for axis in range(6):
         states[axis, column], states[6 + axis, column] = state.x[axis], state.P[axis, axis]
     states[12, column] = state.reached[1]
@@ -259,7 +264,7 @@ def filter_events(
     Parameters
     ----------
     first, begin : wheel sample of the first column of ``out.states``, and of the first state that is recorded now
-    nodes : filled with every time of events; None: no node is stored (numba compiles a function of its own for None)
+    nodes : gets a node for every time of events; None: no node is stored, and numba compiles a separate function
     """
     count, recorded, k = 0, True, begin
     for i in range(len(events.t)):
@@ -288,7 +293,7 @@ def filter_events(
 
 
 def events_until(data: FilterInputs, begin: int, end: int, after: float) -> Events:
-    """Return wheel samples [begin, end) and what is measured after a time [s] until the last of them, in order."""
+    """Return in order of time: wheel samples [begin, end), and all other events after a time [s] until the last one."""
     stamps, until = (data.change_t, data.gnss_t, data.heading_t, data.wheel_t), data.wheel_t[end - 1]
     spans = [np.searchsorted(times, [after, until], side="right").tolist() for times in stamps[:-1]]
     spans.append([begin, end])
@@ -303,11 +308,11 @@ def filter_rows(
     data: FilterInputs, begin: int, end: int, state: FilterState, parameters: FilterParameters, out: FilterOutput,
     first: int, *, keep: bool = False,
 ) -> Nodes:  # fmt: skip
-    """Run the filter over wheel samples [begin, end); return its nodes, none unless they are to be kept.
+    """Run the filter over wheel samples [begin, end); return its nodes if `keep`, else no nodes.
 
     Parameters
     ----------
-    data : of `compiled_inputs`
+    data : result of `compiled_inputs`
     first : wheel sample of the first column of ``out.states``
     """
     events = events_until(data, begin, end, state.reached[0])
@@ -319,13 +324,14 @@ def filter_rows(
 def run_ekf(
     data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, stops: Sequence[int] = ()
 ) -> FilterOutput:
-    """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 [s] over all that follows.
+    """Return the output of the filter from a start over all later measurements.
 
-    Measurements stamped at or before t0 are not used: x0 was made from them. One state is recorded per wheel sample
-    from t0 on, after all updates at its stamp. At equal stamps: terrain changes, GNSS, heading, wheels.
+    Measurements at or before t0 are not used, because x0 was made of them. One state is recorded for each wheel sample
+    from t0 on, after all updates at its stamp. The order at equal stamps is: terrain change, fix, heading, wheels.
 
     Parameters
     ----------
+    t0 : time of the start [s]; x0 : (6,) state; P0 : (6, 6) covariance
     stops : rows of recorded states, ascending, at which the whole covariance is kept
     """
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
@@ -340,16 +346,16 @@ def run_ekf(
 
 
 def compiled_inputs(data: FilterInputs) -> FilterInputs:
-    """Return the inputs in the one form that the kernel is compiled for; only inputs in another form are copied."""
+    """Return the inputs in the form that the kernel is compiled for; only inputs in another form are copied."""
     return FilterInputs._make(np.require(column, requirements=["C", "A", "W"]) for column in data)
 
 
 CHUNK_SAMPLES = 8192
-"""Number of wheel samples whose nodes are kept at once. The nodes need some 30 MB."""
+"""Number of wheel samples whose nodes are kept at a time. The nodes need about 30 MB."""
 
 
 class Smoothed(NamedTuple):
-    """Smoothed states: x (k, 6), variance (k, 6), the diagonal of P."""
+    """Smoothed states x (k, 6), and their variances (k, 6), the diagonal of P."""
 
     x: Floats
     variance: Floats
@@ -363,7 +369,7 @@ def run_smoother(
     Returns
     -------
     Smoothed
-        One state per recorded state of the filter; the last one equals the filter's.
+        A state for each recorded state of the filter; the last one equals the last state of the filter.
     """
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
     chunks, saved = list(pairwise([*range(first, last, chunk_rows), last])), [FilterState.start(t0, x0, P0)]
@@ -375,7 +381,7 @@ def run_smoother(
     for (begin, end), state in zip(reversed(chunks), reversed(saved), strict=True):
         nodes = filter_rows(data, begin, end, state, parameters, forward, begin, keep=True)
         count = len(nodes.row)
-        # the last node is smoothed already: it is the first node of the next chunk, or the end of the run
+        # The last node is already smoothed: it is the first node of the next chunk, or the end of the run.
         nodes = Nodes._make(np.concatenate(columns) for columns in zip(nodes, following, strict=True))
         F = np.tile(np.eye(6), (len(nodes.row) - 1, 1, 1))
         F[:, :3, 2:] += nodes.G[1:]

@@ -1,7 +1,7 @@
-"""Normal equations of parameters that all parts of the data share, after elimination of each part's own parameters.
+"""Normal equations of parameters that all parts of the data share, without the own parameters of each part.
 
-A part's own parameters occur in no residual of another part. Its own normal equations give them for any values of the
-shared ones (a Schur complement), so time and memory grow with the number of parts, not with its cube.
+The own parameters of a part occur in no residual of another part. The normal equations of the part give them for any
+values of the shared parameters (Schur complement), so time and memory grow with the number of parts, not with its cube.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from icrtool.kernels.arrays import Floats, Ints
 
 
 class Parts(NamedTuple):
-    """Which residuals belong to which part of the data, and which parameters.
+    """Residuals and own parameters of each part of the data.
 
     Attributes
     ----------
-    first : (p + 1,) first residual of each part, and the number of all
-    own : number c of parameters that each part has for itself. A Jacobian (m, k + c) has their columns behind the k
-        shared ones; the vector of all parameters (k + p c,) holds the shared ones, then part after part
+    first : (p + 1,) first residual of each part, and the number of all residuals
+    own : number c of own parameters of each part. A Jacobian (m, k + c) has their columns after the columns of the k
+        shared parameters; the vector of all parameters (k + p c,) has the shared parameters, then part after part
     """
 
     first: Ints
     own: int = 0
 
     def split(self, jacobian: Floats) -> tuple[Floats, Floats]:
-        """Return the derivatives by the shared parameters (m, k) and by the part's own (m, c)."""
+        """Return the derivatives by the shared parameters (m, k), and by the own parameters of the part (m, c)."""
         shared = jacobian.shape[1] - self.own
         return jacobian[:, :shared], jacobian[:, shared:]
 
@@ -45,13 +45,13 @@ class Parts(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """A Gauss-Newton step, and how the parts' own parameters follow the shared ones.
+    """A Gauss-Newton step, and how the own parameters of the parts follow the shared parameters.
 
     Attributes
     ----------
-    step : (k + p c,) of all parameters
+    step : (k + p c,) step of all parameters
     decrease : decrease of twice the cost that the normal equations predict
-    gain : (p, c, k): a step s of the shared parameters moves the parameters of a part by -gain s
+    gain : (p, c, k) a step s of the shared parameters changes the own parameters of a part by -gain s
     """
 
     step: Floats
@@ -59,7 +59,7 @@ class Elimination(NamedTuple):
     gain: Floats
 
     def reduced(self, jacobian: Floats, parts: Parts) -> Floats:
-        """Return the derivatives (m, k) by the shared parameters, which the parts' own follow."""
+        """Return the derivatives (m, k) by the shared parameters, while the own parameters follow them."""
         shared, own = parts.split(jacobian)
         return shared - np.einsum("mc,mck->mk", own, parts.by_residual(self.gain)) if parts.own else shared
 
@@ -78,7 +78,8 @@ def eliminate(
     Parameters
     ----------
     residuals, jacobian, weights : (m,), (m, k + c), (m,)
-    pull, away : (k + p c,) information of the prior; parameters minus the prior's mean
+    parts : parts of the data
+    pull, away : (k + p c,) information of the prior; parameters minus the mean of the prior
     """
     count, q, c = len(parts.first) - 1, jacobian.shape[1], parts.own
     k = q - c

@@ -17,11 +17,11 @@ from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, rows_of_ce
 
 
 class Summary(NamedTuple):
-    """Errors of one model, per horizon; (n_horizons,) each, NaN where there was no trial.
+    """Errors of one model at each horizon; (n_horizons,) each, NaN for a horizon without trials.
 
     Attributes
     ----------
-    trials : int64
+    trials : int64, number of trials
     expected, p50, p95, largest : float64 [m]; the expected error is the mean
     """
 
@@ -33,7 +33,7 @@ class Summary(NamedTuple):
 
 
 class Histogram(NamedTuple):
-    """Share of trials by error: float64 (n_bins,) each, bins ``[left, right)`` [m] from zero on, percent of all."""
+    """Percent of the trials by error; float64 (n_bins,) each, bins ``[left, right)`` [m] from zero."""
 
     left: Floats
     right: Floats
@@ -47,16 +47,15 @@ FEWEST_PATH_BLOCKS = 3
 """Smallest number of blocks of path for an interval. A path of less than twelve horizons has no interval."""
 
 MOST_PATH_BLOCKS = 8
-"""Largest number of blocks of path. More blocks make an interval narrower by at most a sixth (Student's factor is 2.36
-with eight blocks, 1.96 without limit), and the blocks are less independent."""
+"""Largest number of blocks of path. More blocks would make an interval narrower by at most a sixth (Student's factor is
+2.36 for eight blocks, 1.96 for any number), and would be less independent."""
 
 HORIZONS_A_BLOCK = 4
-"""Smallest length of a block, in horizons. Errors change slowly over some horizons, so that shorter blocks would not be
+"""Smallest length of a block, in horizons. Errors change slowly over some horizons, so shorter blocks would not be
 independent."""
 
 PRIOR_FREEDOM = 6.0
-"""Degrees of freedom of the spread that is known from other drives. This spread has the weight of seven blocks of
-path."""
+"""Degrees of freedom of a variance that is known from other drives. It has the weight of seven blocks of path."""
 
 LEVEL, NORMAL_FACTOR = 0.95, 1.959964
 """Probability that the interval of a number of this drive contains the true value, and the normal quantile of that
@@ -68,19 +67,18 @@ NEXT_LEVEL, NEXT_NORMAL_FACTOR = 0.90, 1.644854
 
 
 class Spread(NamedTuple):
-    """How the logarithm of p95 differs between drives of one robot on one kind of ground.
+    """Differences of the logarithm of p95 between drives of one robot on one kind of ground.
 
     Attributes
     ----------
-    shift : mean difference of the logarithms, next drive minus this drive. Numbers that were fitted to a drive have
-        smaller errors in it
+    shift : mean difference, next drive minus this drive. Numbers that were fitted to a drive have smaller errors in it
     between : standard deviation between long drives
-    horizon_std : standard deviation of a drive as long as one horizon; the variance falls with the length of the drive
-    grounds : standard deviation between kinds of ground, of numbers that were fitted to other grounds
+    horizon_std : standard deviation in a drive of one horizon; the variance decreases with the length of the drive
+    grounds : standard deviation between kinds of ground, for numbers that were fitted to other grounds
 
     Notes
     -----
-    Measured by ``benchmarks/next_drive.py``, and stated by row in `icrtool.records.rows`.
+    ``benchmarks/next_drive.py`` measures these numbers, and `icrtool.records.rows` states them for each row.
     """
 
     shift: float
@@ -90,7 +88,7 @@ class Spread(NamedTuple):
 
 
 class Intervals(NamedTuple):
-    """Intervals of one horizon [m]: of this drive's numbers with `LEVEL`, of the next drive's with `NEXT_LEVEL`."""
+    """Intervals at one horizon [m]: of this drive with probability `LEVEL`, of the next drive with `NEXT_LEVEL`."""
 
     expected_low: float
     expected_high: float
@@ -101,12 +99,12 @@ class Intervals(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """The path of one horizon's trials, cut into `k` blocks; the same for every model.
+    """The path of the trials of one horizon, cut into k blocks, which are the same for every model.
 
     Attributes
     ----------
-    rows : where the trials stand among all starts
-    first : (k,) first trial of each block; empty where the path is too short for `FEWEST_PATH_BLOCKS`
+    rows : rows of the trials among all starts
+    first : (k,) first trial of each block; empty if the path is too short for `FEWEST_PATH_BLOCKS`
     horizons : length of the path, in horizons
     """
 
@@ -116,14 +114,14 @@ class Blocks(NamedTuple):
 
 
 class BlockSums(NamedTuple):
-    """The trials of one model and horizon, summed over `k` blocks of path.
+    """Sums of the trials of one model and horizon over k blocks of path.
 
     Attributes
     ----------
-    trials : (k,) trials that start in a block
-    errors_m : (k,) [m] sum of their errors
+    trials : (k,) number of trials that start in each block
+    errors_m : (k,) sum of their errors [m]
     above_p50, above_p95 : (k,) number of trials with an error above p50, or p95, of all trials
-    p50_slope_m, p95_slope_m : [m] growth of the percentile with the share of trials
+    p50_slope_m, p95_slope_m : growth of the percentile with the share of trials [m]
     """
 
     trials: Ints
@@ -134,11 +132,12 @@ class BlockSums(NamedTuple):
     p95_slope_m: float
 
     def influence(self, metric: str) -> Floats:
-        """Return how much each block moved a number (``expected``, ``p50``, ``p95``): (k,) [m], with a sum near 0.
+        """Return the influence (k,) [m] of each block on a number (``expected``, ``p50``, ``p95``); the sum is near 0.
 
         Notes
         -----
-        The linear part of the estimate's error: of a mean (ratio of two sums) and of a sample quantile (Bahadur 1966).
+        The influence is the linear part of the error of a mean (ratio of two sums) or of a sample quantile (Bahadur
+        1966).
         """
         count = max(int(self.trials.sum()), 1)
         if metric == "expected":
@@ -154,8 +153,8 @@ def variance_of_sum(influence: Floats) -> float:
 
     Notes
     -----
-    Newey and West (1987) with one lag: a trial is at most as long as a block, so only neighbours share path. The sum of
-    squares alone is the lower bound.
+    Newey and West (1987) with one lag, because a trial is at most as long as a block, so that only neighbours share
+    path. The sum of the squares is a lower bound.
     """
     k = len(influence)
     squares = float(influence @ influence)
@@ -163,17 +162,17 @@ def variance_of_sum(influence: Floats) -> float:
 
 
 def student_factor(freedom: float, z: float = NORMAL_FACTOR) -> float:
-    """Return half the length of an interval in standard deviations, where the deviation is estimated from data.
+    """Return half the length of an interval, in standard deviations that are estimated from data.
 
     Parameters
     ----------
-    freedom : degrees of freedom of the estimate
-    z : half the length in standard deviations, where the deviation is known
+    freedom : degrees of freedom of the estimated standard deviation
+    z : half the length for a known standard deviation
 
     Notes
     -----
-    Student's t expanded about the normal quantile z (Abramowitz and Stegun 1964, 26.7.5): within 1 % from two degrees
-    on, 0.1 % from four.
+    Student's t, expanded about the normal quantile z (Abramowitz and Stegun 1964, 26.7.5). The error is below 1 % from
+    two degrees of freedom on, and below 0.1 % from four.
     """
     inverse = 1.0 / freedom
     terms = (
@@ -199,7 +198,7 @@ def pooled_variance(measured: float, freedom: float, known: float) -> tuple[floa
 
 
 def between_variance(values: Floats, variances: Floats) -> float:
-    """Return the variance between values (k,) beyond their own variances (k,); zero where their own explain all.
+    """Return the variance between values (k,) beyond their own variances (k,); zero if their own variances explain all.
 
     Notes
     -----
@@ -217,12 +216,12 @@ def ground_interval(p95_m: Floats, known_std: float) -> tuple[float, float]:
 
     Parameters
     ----------
-    known_std : standard deviation of the logarithm between grounds, of other robots
+    known_std : standard deviation of the logarithm between grounds, from other robots
 
     Notes
     -----
-    Prediction interval of a normal logarithm, Student's t; the variance between the grounds is pooled with the variance
-    of other robots (`pooled_variance`).
+    Prediction interval of a normal logarithm (Student's t). The variance between the grounds is pooled with the
+    variance of other robots (`pooled_variance`).
     """
     logarithms = np.log(p95_m)
     measured = float(logarithms.var(ddof=1))
@@ -239,24 +238,27 @@ def error_intervals(
 
     Parameters
     ----------
-    errors_m, blocks : as given to `block_sums`, which returned `sums`
-    p50_m, p95_m : of all trials
+    errors_m, blocks : arguments of `block_sums`
+    sums : result of `block_sums`
+    p50_m, p95_m : percentiles of all trials
     spread : spread between drives, known from other drives
 
     Returns
     -------
-    NaN without trials.
+    Intervals
+        NaN without trials.
 
     Notes
     -----
     The logarithms of the errors are normal, and the intervals follow from Student's t (1908). The variance of a drive
     is the variance that its blocks show, pooled with the variance of drives of its length (`pooled_variance`), because
-    few blocks alone would give intervals of any width. p95 changes in proportion to the root mean square. Blocks show
-    the root mean square better than the few trials above p95 show p95. On short paths p95 is smaller than on long ones,
-    its logarithm by about the variance of the logarithm. The upper end is raised by this variance. The interval of this
-    drive's p95 does not go below its median, nor above the interval of the next drive.
+    few blocks alone would give intervals of any width. p95 is proportional to the root mean square, and blocks show the
+    root mean square better than the few trials above p95 show p95. On a short path the logarithm of p95 is smaller than
+    on a long path, by about its variance, so the upper end is raised by this variance. The interval of p95 of this
+    drive does not go below the median, nor above the interval of the next drive.
 
-    The next drive, of the same length, adds the variance of its own finite path and the variance between drives.
+    The variance of the next drive, of the same length, is larger by the variance of its own finite path and the
+    variance between drives.
     """
     if blocks is None or not math.isfinite(p95_m):
         return Intervals(*(math.nan,) * 6)
@@ -278,7 +280,7 @@ def error_intervals(
 
 
 def _block_variances(errors_m: Floats, blocks: Blocks, sums: BlockSums, expected_m: float) -> tuple[float, float]:
-    """Return the variances of the logarithms of mean and root mean square that the blocks show; both are bounded."""
+    """Return the variances of the logarithms of mean and root mean square that the blocks show."""
     squares, trials = np.add.reduceat(errors_m[blocks.rows] ** 2, blocks.first), sums.trials
     of_rms = variance_of_sum(np.asarray(squares / squares.sum() - trials / trials.sum()) / 2.0)
     return variance_of_sum(sums.influence("expected") / expected_m), of_rms
@@ -287,11 +289,13 @@ def _block_variances(errors_m: Floats, blocks: Blocks, sums: BlockSums, expected
 def difference_half_width(
     now: BlockSums | None, before: BlockSums | None, metric: str, factor: float, *, paired: bool
 ) -> float:
-    """Return half the confidence interval [m] of ``number - factor * baseline``; NaN where there is none.
+    """Return half the confidence interval [m] of ``number - factor * baseline``; NaN without an interval.
 
     Parameters
     ----------
-    paired : both have the same blocks of path, whose errors are then compared one by one
+    now, before : block sums of the number, and of the baseline
+    metric, factor : name of the number, and factor of the baseline
+    paired : both have the same blocks of path, whose errors are then compared in pairs
 
     Notes
     -----
@@ -318,14 +322,15 @@ def block_sums(
 
     Parameters
     ----------
-    errors_m : (n,) [m], NaN where there was no trial
-    blocks : of `cut_blocks`
-    ranked : of `errors_m`
-    p50_m, p95_m : percentiles of all
+    errors_m : (n,) errors of all starts [m]; NaN for a start without a trial
+    blocks : result of `cut_blocks`
+    ranked : the trials in `errors_m`
+    p50_m, p95_m : percentiles of all trials
 
     Returns
     -------
-    None without blocks.
+    BlockSums or None
+        None without blocks.
     """
     if blocks is None or not len(blocks.first):
         return None
@@ -336,7 +341,7 @@ def block_sums(
     above = [np.array([np.count_nonzero(block_m > limit) for block_m in blocks_m]) for limit in (p50_m, p95_m)]
     growth = []
     for share, count in zip(SHARES.values(), above, strict=True):
-        # Growth of a percentile with its share, over the range of the share's uncertainty (Woodruff 1952).
+        # The growth of a percentile with its share is taken over the uncertainty of the share (Woodruff 1952).
         std = math.sqrt(variance_of_sum(np.asarray((count - (1.0 - share) * trials) / len(errors))))
         low, high = max(share - std, 0.0), min(share + std, 1.0)
         growth.append((ranked.quantile(high) - ranked.quantile(low)) / (high - low) if high > low else 0.0)
@@ -344,11 +349,11 @@ def block_sums(
 
 
 PERCENTILE_CELLS = 1024
-"""Number of cells into which errors are sorted to find a percentile. A cell then holds few errors."""
+"""Number of cells into which errors are sorted to find a percentile. A cell holds few errors."""
 
 
 def count_cells(errors_m: Floats, width_m: float) -> tuple[NDArray[np.int16], Ints]:
-    """Return the cell of each error (m,) [m], for cells of this width from zero on, and the number in each cell."""
+    """Return the cell of each error (m,) [m], for cells of this width from zero, and the number in each cell."""
     cell = np.empty(len(errors_m), np.int16)
     counts = np.zeros(int(errors_m.max() / width_m) + 1 if len(errors_m) else 0, np.int64)
     for lo in range(0, len(errors_m), ROWS_AT_ONCE):
@@ -359,13 +364,13 @@ def count_cells(errors_m: Floats, width_m: float) -> tuple[NDArray[np.int16], In
 
 
 class RankedTrials(NamedTuple):
-    """The trials of one horizon, in which any rank is found without sorting: by cells of equal width.
+    """The trials of one horizon, in cells of equal width, in which any rank is found without sorting.
 
     Attributes
     ----------
-    errors_m : (m,) [m], in the order of their starts
-    cell : int16 (m,) the cell of each
-    before : (cells + 1,) trials in all cells before each
+    errors_m : (m,) errors in the order of their starts [m]
+    cell : int16 (m,) cell of each error
+    before : (cells + 1,) number of trials in all cells before each cell
     """
 
     errors_m: Floats
@@ -374,17 +379,17 @@ class RankedTrials(NamedTuple):
 
     @classmethod
     def of(cls, errors_m: Floats) -> RankedTrials:
-        """Return the trials among errors (n,) [m], NaN where there was none."""
+        """Return the trials in errors (n,) [m], which are NaN for a start without a trial."""
         trials = errors_m[~np.isnan(errors_m)]
         cell, counts = count_cells(trials, trials.max(initial=0.0) / PERCENTILE_CELLS or 1.0)
         return cls(trials, cell, np.append(0, np.cumsum(counts)))
 
     def quantile(self, share: float) -> float:
-        """Return numpy's 'linear' quantile of the errors; at least one error is needed."""
+        """Return the quantile of at least one error [m], with the method 'linear' of ``numpy.quantile``."""
         last = len(self.errors_m) - 1
         rank = share * last
         ranks = np.array([math.floor(rank), min(math.floor(rank) + 1, last)])
-        # Python numbers: a comparison with numpy's numbers would widen the type of the cells
+        # Python numbers are used, because a comparison with numpy's numbers would widen the type of the cells.
         begin, end = (np.searchsorted(self.before, ranks, side="right") - 1).tolist()
         near = self.errors_m[(self.cell >= begin) & (self.cell <= end)]
         ranks -= self.before[begin]
@@ -392,14 +397,14 @@ class RankedTrials(NamedTuple):
         return float(low + (high - low) * (rank % 1.0))
 
     def summary(self) -> tuple[int, float, float, float, float]:
-        """Return number, mean, p50, p95 and largest; NaN without trials."""
+        """Return the number of trials, and mean, p50, p95 and largest error [m]; NaN without trials."""
         if not len(self.errors_m):
             return 0, math.nan, math.nan, math.nan, math.nan
         p50, p95 = map(self.quantile, SHARES.values())
         return len(self.errors_m), float(self.errors_m.mean()), p50, p95, float(self.errors_m.max())
 
     def histogram(self, bin_width_m: float) -> Histogram:
-        """Return the trials in bins of `bin_width_m` [m] from zero to the largest error (Figs. 28-30)."""
+        """Return the histogram of the trials from zero to the largest error (Pentzer 2014, Figs. 28-30)."""
         _, counts = count_cells(self.errors_m, bin_width_m)
         edges = bin_width_m * np.arange(len(counts) + 1, dtype=np.float64)
         return Histogram(edges[:-1], edges[1:], 100.0 * counts / max(len(self.errors_m), 1))
@@ -408,7 +413,7 @@ class RankedTrials(NamedTuple):
 BLOCK_PARTS = 4
 """Number of parts of a horizon. Blocks begin at every quarter of a horizon."""
 HISTOGRAM_BINS = 50
-"""Number of bins from zero to the largest error; a histogram has this number or fewer."""
+"""Largest number of bins of a histogram from zero to the largest error."""
 
 
 def error_summary(errors_m: Floats) -> Summary:
@@ -416,8 +421,8 @@ def error_summary(errors_m: Floats) -> Summary:
 
     Notes
     -----
-    Section 6.4. The paper's expected error weighs a histogram, which is the mean once bins are narrow. Percentiles
-    interpolate linearly between order statistics, as ``numpy.percentile`` does.
+    Pentzer 2014, Section 6.4. The paper computes the expected error from a histogram, which gives the mean if bins are
+    narrow. Percentiles interpolate linearly between order statistics, as ``numpy.percentile`` does.
     """
     columns = [RankedTrials.of(column).summary() for column in errors_m.T]
     trials, *numbers = np.array(columns).reshape(-1, len(Summary._fields)).T
@@ -429,17 +434,19 @@ def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
 
     Parameters
     ----------
-    tried : (n,) whether there is a trial from a start
-    path_m : (n,) [m], path length at each start, non-decreasing
+    tried : (n,) whether there is a trial from each start
+    path_m : (n,) path length at each start [m], non-decreasing
+    horizon_m : the horizon [m]
 
     Returns
     -------
-    None where there is no trial. Path without trials is left out.
+    Blocks or None
+        Path without trials is left out; None without trials.
     """
     if not (count := int(np.count_nonzero(tried))):
         return None
     begin, end = int(np.argmax(tried)), len(tried) - int(np.argmax(tried[::-1]))
-    # the usual case is one stretch, and a slice copies nothing
+    # Usually the trials form one stretch, whose slice copies nothing.
     rows = slice(begin, end) if end - begin == count else tried
     path = path_m[rows]
     first = rows_of_cells(path, lambda part: np.floor((part - path[0]) * (BLOCK_PARTS / horizon_m)))
@@ -461,17 +468,20 @@ def round_bin_width(largest_m: float) -> float:
 
 
 def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool, tuple[float, float]] | None:
-    """Return the distance up to which errors (h,) [m] at distances (h,) [m] stay within a budget; 0 m at 0 m.
+    """Return the distance up to which errors (h,) [m] at horizons (h,) [m] stay within a budget; the error at 0 m is 0.
 
     Returns
     -------
-    The interpolated distance, whether the error is within the budget at the last distance, and the two distances
-    between which it was interpolated; None without errors.
+    distance_m : the interpolated distance
+    beyond : whether the error is within the budget at the last horizon, too
+    between_m : the two horizons between which the distance was interpolated
+
+    The result is None without errors.
 
     Notes
     -----
-    With few trials the errors may fall with the distance. They are replaced by the nearest values that never fall
-    (isotonic regression, Barlow et al. 1972: the largest over beginnings of the smallest mean over ends).
+    With few trials the errors may decrease with the distance. They are replaced by the nearest values that never
+    decrease (isotonic regression, Barlow et al. 1972: the largest over beginnings of the smallest mean over ends).
     """
     is_known = np.isfinite(p95_m)
     if not is_known.any():
@@ -488,7 +498,7 @@ def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[f
 
 
 def never_falling(values: Floats) -> Floats:
-    """Return the values (n,) that never fall and are nearest to given ones by least squares."""
+    """Return the values (n,) that never decrease and are nearest to the given values (n,) by least squares."""
     sums, n = np.concatenate([[0.0], np.cumsum(values)]), len(values)
     first, last = np.arange(n)[:, None], np.arange(n)
     length = last - first + 1

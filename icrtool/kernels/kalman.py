@@ -1,14 +1,14 @@
 """Steps of Kalman filters and smoothers for any number of states, and the filter of a heading that uses them.
 
-One propagate, one correct, one step back. The covariance P is (k, k), symmetric, and changed in place, as is the state
-x (k,). Kalman 1960; Rauch, Tung, Striebel 1965. Sizes are arguments: a plain number in a call is a constant to the
-compiler, which then unrolls the loops.
+The module has one function that propagates, one that corrects, and one that steps back. They change the state x (k,)
+and the symmetric covariance P (k, k) in place. Kalman 1960; Rauch, Tung, Striebel 1965. Sizes are arguments, because a
+plain number in a call is a constant for the compiler, which then unrolls the loops.
 
-The filter of a heading goes event by event. Its state is x = (heading, bias, scale error, further ones): the heading,
-constants and slowly varying errors. Between events the heading grows by (1 + scale) turn - bias dt, with turn the
-integrated rate; further states stay, or decay to zero. Every event measures one number: z = h x + noise, wrapped where
-it is an angle. An innovation beyond `HUBER_SIGMAS` counts as an innovation of `HUBER_SIGMAS` (bounded influence:
-Masreliez and Martin 1977). Some states are uncertain but not estimated (Schmidt 1966).
+The filter of a heading goes event by event. Its state is x = (heading, bias, scale error, …): the heading, constants
+and slowly varying errors. Between events the heading grows by (1 + scale) turn - bias dt, where turn is the integrated
+rate; the other states stay, or decay to zero. Every event measures one number z = h x + noise, whose innovation is
+wrapped if it is an angle. An innovation beyond `HUBER_SIGMAS` counts as an innovation of `HUBER_SIGMAS` (bounded
+influence: Masreliez and Martin 1977). Some states are uncertain but not estimated (Schmidt 1966).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from icrtool.kernels.compiled import njit, njit_part
 def propagate(G: Floats, P: Floats, T: Floats, m: int, first: int, c: int, k: int) -> None:
     """Replace P by F P F^T (Eq. 16): F is the identity plus G (m, c) in its first rows, from column `first` on.
 
-    T (m, k) is memory for intermediate results.
+    T (m, k) is space for intermediate results.
     """
     for i in range(m):
         for j in range(k):
@@ -48,7 +48,7 @@ def propagate(G: Floats, P: Floats, T: Floats, m: int, first: int, c: int, k: in
 def correct(x: Floats, P: Floats, Ph: Floats, S: float, nu: float, fixed: Bools | None, k: int) -> None:
     """Apply a scalar innovation nu of variance S, with Ph = P h^T (Eqs. 21, 24, 25).
 
-    States that are `fixed` (k,) keep their value and variance: uncertain, but not estimated (Schmidt 1966).
+    States that are `fixed` (k,) keep their value and variance: they are uncertain, but not estimated (Schmidt 1966).
     """
     for i in range(k):
         K = Ph[i] / S
@@ -64,7 +64,7 @@ def correct(x: Floats, P: Floats, Ph: Floats, S: float, nu: float, fixed: Bools 
 @njit_part
 def store(x: Floats, P: Floats, states: Floats, covariances: Floats, i: int) -> None:
     """Store a state and its covariance in row i of states (n, k) and covariances (n, k, k)."""
-    # Element by element: numba takes seconds to compile the assignment of an array to a row of a larger one.
+    # Elements are assigned one by one, because numba takes seconds to compile the assignment of an array to a row.
     for a in range(len(x)):
         states[i, a] = x[a]
         for b in range(len(x)):
@@ -72,29 +72,30 @@ def store(x: Floats, P: Floats, states: Floats, covariances: Floats, i: int) -> 
 
 
 def smooth_passes(F: Floats, x_predicted: Floats, P_predicted: Floats, x: Floats, P: Floats) -> None:
-    """Smooth states x (n, k) and covariances P (n, k, k) in place, from the last one back.
+    """Smooth states x (n, k) and covariances P (n, k, k) in place, backwards from the last event.
 
     Parameters
     ----------
-    F : (n - 1, k, k), from each event to the next
-    x_predicted, P_predicted : (n, k), (n, k, k)
+    F : (n - 1, k, k) transition from each event to the next one
+    x_predicted, P_predicted : (n, k), (n, k, k) state and covariance that were predicted at each event
 
     Notes
     -----
-    C = P F^T (P-)^-1, with P- predicted at the next event; x + C (x_next - x-), P + C (P_next - P-) C^T.
+    Rauch, Tung, Striebel 1965: C = P F^T (P-)^-1, with P- predicted at the next event; the smoothed state is
+    x + C (x_next - x-), its covariance P + C (P_next - P-) C^T.
     """
     for lo in reversed(range(0, len(F), ROWS_AT_ONCE)):
         hi = min(lo + ROWS_AT_ONCE, len(F))
         following, both = slice(lo + 1, hi + 1), slice(lo, hi + 1)
         certain = np.diagonal(P_predicted[following], axis1=1, axis2=2) == 0.0
-        # A state with variance 0 stays as it is: a variance of 1 in its place only keeps the matrix invertible.
+        # A state with variance 0 does not change. A variance of 1 in its place keeps the matrix invertible.
         solved = np.linalg.solve(P_predicted[following] + certain[:, :, None] * np.eye(x.shape[1]), F[lo:hi] @ P[lo:hi])
         step_back(solved, x_predicted[both], P_predicted[both], x[both], P[both], np.empty(P.shape[1:]))
 
 
 @njit
 def step_back(gains: Floats, x_predicted: Floats, P_predicted: Floats, x: Floats, P: Floats, T: Floats) -> None:
-    """Do the steps of `smooth_passes`; gains (n - 1, k, k) are the C^T, T (k, k) is space."""
+    """Do the steps of `smooth_passes`; gains (n - 1, k, k) are the matrices C^T, and T (k, k) is space."""
     n, k = x.shape
     for i in range(n - 2, -1, -1):
         for a in range(k):
@@ -118,9 +119,9 @@ class HeadingEvents(NamedTuple):
 
     Attributes
     ----------
-    dt : seconds since the event before; turn : integrated turn rate over them [rad]
-    extra : further variance of that turn [rad^2]
-    z : measured value; h : (n, k) its derivative by the state; r : its variance; angle : whether z is an angle
+    dt : time since the event before [s]; turn : integrated turn rate over this time [rad]
+    extra : further variance of this turn [rad^2]
+    z : measured value; h : (n, k) derivative of z by the state; r : variance of z; angle : whether z is an angle
     """
 
     dt: Floats
@@ -132,7 +133,7 @@ class HeadingEvents(NamedTuple):
     angle: Bools
 
     def cut(self, count: int | None) -> HeadingEvents:
-        """Return the first events; None: all."""
+        """Return the first `count` events; None: all events."""
         return HeadingEvents._make(column[:count] for column in self)
 
 
@@ -141,8 +142,8 @@ class HeadingModel(NamedTuple):
 
     Attributes
     ----------
-    x : (k,), P : (k, k) at the first event
-    q : (k,) process variance per second; decay : (k,) [1/s], 0 for a state that stays
+    x, P : (k,), (k, k) state and covariance at the first event
+    q : (k,) process variance per second; decay : (k,) rate of the decay to zero [1/s], 0 for a state that stays
     fixed : (k,) states that keep their values: their uncertainty counts, but they are not estimated
     """
 
@@ -154,7 +155,7 @@ class HeadingModel(NamedTuple):
 
 
 class HeadingPasses(NamedTuple):
-    """The forward pass: predicted and updated (n, k), (n, k, k), innovations (n,) and their variances (n,)."""
+    """The forward pass: predicted and updated states (n, k) and covariances (n, k, k), innovations, variances (n,)."""
 
     x_predicted: Floats
     P_predicted: Floats
@@ -165,7 +166,7 @@ class HeadingPasses(NamedTuple):
 
 
 def filter_headings(events: HeadingEvents, model: HeadingModel) -> HeadingPasses:
-    """Return the forward pass of the filter over events."""
+    """Return the forward pass of the heading filter over events."""
     n, k = events.h.shape
     out = HeadingPasses(
         np.empty((n, k)), np.empty((n, k, k)), np.empty((n, k)), np.empty((n, k, k)), np.empty(n), np.empty(n)
@@ -181,7 +182,7 @@ def heading_log_likelihood(events: HeadingEvents, model: HeadingModel) -> float:
 
 
 def _run(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> float:
-    """Run the filter, fill `out` where it has rows, and return the log likelihood."""
+    """Run the filter, fill `out` if it has rows, and return the log likelihood."""
     k = len(model.x)
     start = model._replace(x=model.x.copy(), P=model.P.copy())
     return float(_forward(events, start, out, np.empty((1, 2)), np.empty(k), np.empty((1, k))))
@@ -189,6 +190,7 @@ def _run(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> floa
 
 @njit
 def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses, G: Floats, Ph: Floats, T: Floats) -> float:
+    """Do the work of `_run` from `model`, which is changed; G (1, 2), Ph (k,) and T (1, k) are space."""
     n, k = events.h.shape
     x, P = model.x, model.P
     stored, likelihood = len(out.innovation) > 0, 0.0
@@ -232,7 +234,7 @@ def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses, G: 
 
 
 def smooth_headings(events: HeadingEvents, model: HeadingModel, passes: HeadingPasses) -> tuple[Floats, Floats]:
-    """Return smoothed states (n, k) and their covariances (n, k, k)."""
+    """Return the smoothed states (n, k) and their covariances (n, k, k)."""
     n, k = events.h.shape
     F = np.zeros((n - 1, k, k))
     F[:, np.arange(k), np.arange(k)] = np.exp(-model.decay * events.dt[1:, None])

@@ -1,8 +1,9 @@
-"""Open-loop propagation from recorded states: one path, all trials step by step, and a fast form of the same errors.
+"""Open-loop propagation from recorded states: one path, all trials step by step, and the same errors by a fast method.
 
-The dropout analysis of Pentzer 2014, Section 6.4: freeze the ICRs estimated at a state, drive on with wheel speeds
-alone, and compare with the reference when the path has grown by a horizon. `open_loop_errors_direct` integrates every
-trajectory and is the oracle; `open_loop_errors` gives the same errors at the cost of a few passes over the log.
+The dropout analysis of Pentzer 2014, Section 6.4: the ICRs that are estimated at a state are frozen, wheel speeds alone
+predict the path, and its end is compared with the reference when the path has grown by a horizon.
+`open_loop_errors_direct` integrates every trajectory and is the oracle; `open_loop_errors` gives the same errors at the
+cost of a few passes over the log.
 
 Write the plane as complex numbers, z = north + j east, with a = 1/W and D_i the sum of dt (v_l - v_r) up to state i.
 The Euler steps from state k with frozen ICRs (Eqs. 8-12, Section 6.4) turn by a (D_i - D_k), hence
@@ -14,9 +15,9 @@ around the centre a_c of a block of starts, with half width w and a = a_c + w q,
 
     e^{j a D} = e^{j a_c D} sum_m (j w D)^m / m! q^m,
 
-so a few prefix sums (the moments m = 0, 1, ...) serve every start of the block by a polynomial in q. Their number
-follows from w max|D|. One sine and cosine a state do for all moments; interpolation between Chebyshev nodes in a takes
-the same number of sums, but a sine and cosine for each sum, and was 1.7 times slower.
+so that a few prefix sums (the moments m = 0, 1, ...) give the errors of every start of the block by a polynomial in q.
+Their number follows from w max|D|. All moments of a state need one sine and one cosine. Interpolation between Chebyshev
+nodes in a needs the same number of sums, but a sine and a cosine for each, and was 1.7 times slower.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, euler_step
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
 
 Columns = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
-"""Columns of a track that is made of states: held, v_left, v_right, north, east, heading."""
+"""Columns of a track of states: held, v_left, v_right, north, east, heading."""
 
 
 @njit
@@ -45,8 +46,8 @@ def integrate_trials(
 
     Notes
     -----
-    The path is integrated from the origin with heading zero and turned into place at its end: the same path, but its
-    rounding does not depend on where the datum is or how often the robot has turned.
+    The path is integrated from the origin with heading zero, and turned into place at its end. Its rounding then does
+    not depend on the distance of the datum or on the number of turns of the robot.
     """
     held, v_left, v_right, north, east, heading = columns
     each = 0 if len(icrs.x_icr) == 1 else 1
@@ -85,7 +86,7 @@ def integrate_trials(
 
 
 def compiled_columns(track: Track) -> Columns:
-    """Return the columns of a track in the one form that kernels are compiled for; only other forms are copied.
+    """Return the columns of a track in the form that kernels are compiled for; only other forms are copied.
 
     Notes
     -----
@@ -97,23 +98,24 @@ def compiled_columns(track: Track) -> Columns:
 
 
 def compiled_icrs(icrs: FrozenIcrs) -> FrozenIcrs:
-    """Return `icrs` in the one form the kernels are compiled for (see `compiled_columns`)."""
+    """Return ICRs in the form that kernels are compiled for (see `compiled_columns`)."""
     return FrozenIcrs(*[np.require(column, np.float64, ["C", "A", "W"]) for column in icrs])
 
 
 def open_loop_errors_direct(track: Track, icrs: FrozenIcrs, ends: Rows, lo: int = 0) -> Floats:
-    """Return the errors of trials that are integrated step by step: O(starts x steps), the oracle.
+    """Return the errors of trials by integration step by step, in O(starts x steps): the oracle of `open_loop_errors`.
 
     Parameters
     ----------
-    track : of recorded states (n,)
-    icrs : the ICRs with which each start drives
-    ends : (n_starts, n_horizons) of `trial_ends`, for the starts from `lo` on
+    track : track of recorded states (n,)
+    icrs : ICRs that predict the trial from each start
+    ends : (n_starts, n_horizons) result of `trial_ends` for the starts from `lo` on
 
     Returns
     -------
-    float64 (n_starts, n_horizons) [m], one horizon contiguous: horizontal distance between the open-loop position and
-    the reference at the trial's end; NaN where there is no trial.
+    float64 (n_starts, n_horizons)
+        Horizontal distance [m] between the open-loop position and the reference at the end of each trial, each horizon
+        contiguous; NaN for a start without a trial.
 
     Notes
     -----
@@ -132,7 +134,8 @@ def open_loop_path(
 
     Returns
     -------
-    The path at every state from `start` to `end`, both included, beginning at the reference pose of `start`.
+    OpenLoopPath
+        The path at every state from `start` to `end`, both included. It begins at the reference pose of `start`.
     """
     path = OpenLoopPath(*np.empty((3, end - start + 1)))
     path.north[0], path.east[0], path.heading[0] = track.north[start], track.east[start], track.heading[start]
@@ -143,13 +146,14 @@ def open_loop_path(
 
 
 def open_loop_pieces(track: Track, icrs: FrozenIcrs, start: int, end: int) -> Iterator[tuple[slice, OpenLoopPath]]:
-    """Yield the states after `start` piece by piece, and the open-loop path at them.
+    """Yield the states after `start` in pieces, and the open-loop path at them.
 
-    `icrs` hold one triple for the whole path, or one for each state of the track: each step is driven with its own.
+    `icrs` has one triple for the whole path, or one for each state of the track, which then holds until the next state.
     """
     turned, place = 0.0, 0j
     ahead = cmath.exp(1j * track.heading[start])
-    for lo in range(start, end, ROWS_AT_ONCE):  # a path of a whole drive is as long as a column of the run
+    for lo in range(start, end, ROWS_AT_ONCE):
+        # The path is computed in pieces, because a whole path is as large as a column of the run.
         chunk = slice(lo, min(lo + ROWS_AT_ONCE, end))
         y_icr_right, y_icr_left, x_icr = (column if len(column) == 1 else column[chunk] for column in icrs)
         over = track.held[chunk] / np.maximum(np.abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M)
@@ -169,35 +173,36 @@ def open_loop_pieces(track: Track, icrs: FrozenIcrs, start: int, end: int) -> It
 
 
 TOLERANCE_M = 1e-11
-"""Largest error [m] of an end position by the moments left out. With rounding the total stays well below 1e-9 m."""
+"""Largest error of an end position by the moments that are left out [m]. With rounding, the error is well below 1e-9
+m."""
 ROUNDING_LIMIT_M = 2e-10
-"""Possible rounding error of an end position [m] from which on the path is integrated directly."""
+"""Bound of the rounding error of an end position above which the path is integrated directly [m]."""
 MAX_MOMENTS = 16
-"""Largest number of moments of a block. A block that needs more is split, because halving the block is cheaper than
-doubling its moments."""
+"""Largest number of moments of a block. A block that needs more moments is split, because two halves cost less than
+twice the moments."""
 MIN_BLOCK = 8
-"""Number of starts at which a block is integrated directly instead of being split, which would not be faster."""
+"""Number of starts of a block that is integrated directly and not split, because splitting would not be faster."""
 BLOCK = 4096
-"""Number of starts of a block. A block has at least one start for each state of its first trial, so that its window is
-about twice the block."""
+"""Usual number of starts of a block. A block has at least one start for each state of its first trial, so that the
+states of its trials are about twice its starts."""
 CONSTANT_BLOCK = 8192
-"""Number of starts of a block where every start has the same ICRs. One moment is then enough, and a longer block shares
+"""Number of starts of a block if every start has the same ICRs. One moment is then enough, and a longer block shares
 more sums."""
 MAX_BLOCK = 32768
-"""Number of starts of the longest block, and of states whose moments are kept at once. It bounds the memory to a few
-MB."""
+"""Largest number of starts of a block, and number of states whose moments are kept at a time. It bounds the memory to a
+few MB."""
 _EPS = 2.220446049250313e-16
 """Distance from 1 to the next double."""
 
 
 class BlockPlan(NamedTuple):
-    """How the errors of a block of starts are computed.
+    """Plan for the errors of a block of starts.
 
     Attributes
     ----------
-    moments : number of moments; 0: no number of moments keeps the tolerance
+    moments : number of moments; 0 if no number of moments is within the tolerance
     a_centre, half_width : a_c and w [1/m]
-    first_turn : D [m] of the block's first state, against the middle of its range
+    first_turn : D of the first state of the block, from the middle of the range of D [m]
     """
 
     moments: int
@@ -211,8 +216,8 @@ class WheelSteps(NamedTuple):
 
     Attributes
     ----------
-    left, right : (n,) [m]; 0 over gaps, which no trial spans
-    turn : (n + 1,) D [m] at their states
+    left, right : (n,) travel of the sides in each step [m]; 0 over gaps, which no trial crosses
+    turn : (n + 1,) D at the states before, between and after the steps [m]
     """
 
     first: int
@@ -222,7 +227,7 @@ class WheelSteps(NamedTuple):
 
 
 def wheel_steps(columns: Columns, first: int, last: int, turn: float) -> Iterator[WheelSteps]:
-    """Yield the steps from state `first`, where D is `turn` [m], to state `last`, some at a time."""
+    """Yield the steps from state `first`, where D is `turn` [m], to state `last`, in chunks."""
     held, v_left, v_right, *_ = columns
     for lo in range(first, last, MAX_BLOCK):
         chunk = slice(lo, min(lo + MAX_BLOCK, last))
@@ -233,11 +238,11 @@ def wheel_steps(columns: Columns, first: int, last: int, turn: float) -> Iterato
 
 
 def plan_block(columns: Columns, icrs: FrozenIcrs, last: int, starts: slice) -> BlockPlan:
-    """Return the moments to use for some starts and their `icrs`; their trials end at state `last` or before.
+    """Return the plan for some starts and their `icrs`, whose trials end at state `last` or before.
 
     Notes
     -----
-    The error after M moments is below scale (w r)^M / M! / (1 - w r / (M + 1)), with r the half range of D and scale
+    The error after M moments is below s (w r)^M / M! / (1 - w r / (M + 1)), where r is half of the range of D, and s
     the length of a path on which nothing cancels.
     """
     turn_min, turn_max, travel_left, travel_right = 0.0, 0.0, 0.0, 0.0
@@ -288,12 +293,12 @@ def sum_moments(
 
 
 def freeze_starts(plan: BlockPlan, icrs: FrozenIcrs, heading: Floats, turn: Floats) -> Floats:
-    """Return the constants of each start (k, 7): q, the factors of the left and the right sum, and its place, still 0.
+    """Return the constants of each start (k, 7): q, the factors of the left and of the right sum, and 0 for its place.
 
     The factors are a e^{j(psi - a D)} (y_r - j x) and a e^{j(psi - a D)} (y_l - j x).
     """
     a, frozen = _turn_gain(icrs), np.zeros((len(heading), 7))
-    # two angles, not their difference: psi may be thousands of radians, a D is small
+    # The two angles are not subtracted, because psi may be thousands of radians and a D is small.
     common = a * np.exp(1j * heading) * np.exp(-1j * a * turn)
     frozen[:, 0] = (a - plan.a_centre) / plan.half_width if plan.half_width > 0.0 else 0.0
     for column, y_icr in ((1, icrs.y_icr_right), (3, icrs.y_icr_left)):
@@ -311,8 +316,8 @@ def fill_errors(
 
     Parameters
     ----------
-    ends, errors : (horizons, starts); row_lo : the block's first start there, which is state `start`
-    frozen : of `freeze_starts`; the place of each start is filled in where its state is a state of `sums`
+    ends, errors : (horizons, starts); row_lo : row of the block's first start, which is state `start`
+    frozen : result of `freeze_starts`; the place of each start is filled in if its state is a state of `sums`
 
     Notes
     -----
@@ -322,7 +327,7 @@ def fill_errors(
     for h in range(-1, len(ends)):
         for s in range(len(frozen)):
             e = (start + s if h < 0 else ends[h, row_lo + s]) - first
-            # the state at a border is the last of one part and the first of the next
+            # The state at a border is the last state of one chunk and the first state of the next.
             if e < 0 or e >= len(sums):
                 continue
             q, left_re, left_im, right_re, right_im = (

@@ -1,8 +1,8 @@
 """Robust statistics and robust least squares: median absolute deviation, loss weights, Gauss-Newton with priors.
 
-Residuals of overlapping windows are not independent. Where the data are weighed against the prior, `overlap` residuals
-count as one. The covariance is computed from the spread between groups of residuals (a stretch of distance of one log),
-not between single residuals.
+Residuals of overlapping windows are not independent. In comparison with the prior, `overlap` residuals count as one.
+The covariance is computed from the spread between groups of residuals (a stretch of distance of one log), and not from
+the spread between single residuals.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ LOSS_SIGMAS = 2.0
 """Size of a residual at which the loss changes from square to linear, in robust standard deviations."""
 
 SMALLEST_SCALE = 1e-5
-"""Smallest robust standard deviation of residuals [m, rad]; no sensor is as exact. Residuals of an exact fit have no
-spread: with a smaller value the information of exact data would exceed the information of a prior by 16 digits, and the
-covariance of parameters that the data do not show would be rounding error."""
+"""Smallest robust standard deviation of residuals [m, rad]. No sensor is as exact. With a smaller value, the
+information of exact data would exceed the information of a prior by 16 digits, and the covariance of parameters that
+the data do not show would be a rounding error."""
 
 LAST_STEP_SIGMAS = 0.03
-"""Length of a Gauss-Newton step, in standard deviations of all parameters together, below which it is the last step."""
+"""Length of a Gauss-Newton step below which it is the last step, in standard deviations of all parameters together."""
 
 MOST_HALVINGS = 6
 """Largest number of halvings of a Gauss-Newton step."""
@@ -37,7 +37,7 @@ FEWEST_CORRELATED_BLOCKS = 8
 """Smallest number of values from which a correlation between neighbours is estimated."""
 
 LARGEST_CORRELATION = 0.9
-"""Limit of an estimated correlation between neighbours."""
+"""Largest estimated correlation between neighbours."""
 
 
 def mad_std(values: Floats, centre: float | None = None) -> float:
@@ -45,11 +45,11 @@ def mad_std(values: Floats, centre: float | None = None) -> float:
 
     Parameters
     ----------
-    centre : point from which deviations are measured; default the median. Residuals take 0.
+    centre : value from which deviations are measured; default: the median. It is 0 for residuals
 
     Notes
     -----
-    Hampel 1974. NaN for no values.
+    Hampel 1974. The result is NaN without values.
     """
     if not len(values):
         return float("nan")
@@ -79,7 +79,7 @@ class Linearised:
 
     Attributes
     ----------
-    residuals : (m,), jacobian : (m, k)
+    residuals, jacobian : (m,), (m, k) residuals and their derivatives
     scale : (m,) robust standard deviation of the kind of each residual
     prior : (k, k) information of the prior
     overlap : number of residuals that count as one independent residual
@@ -98,7 +98,7 @@ class Linearised:
 
     @cached_property
     def of_data(self) -> Floats:
-        """Gauss-Newton matrix (k, k) of the data, one residual in `overlap`."""
+        """Gauss-Newton matrix (k, k) of the data, in which `overlap` residuals count as one."""
         return normal_equations(self.residuals, self.jacobian, self.weights)[0]
 
     @property
@@ -107,7 +107,7 @@ class Linearised:
         return self.of_data + self.prior
 
     def gradients(self, group: Ints) -> Floats:
-        """Return the gradient (g, k) of the data of each group (m,), in their order."""
+        """Return the gradient (g, k) of the data of each group, in their order; `group` (m,) is the group of each residual."""
         order, first = _grouped(group)
         gradients: Floats = np.add.reduceat((self.jacobian * (self.weights * self.residuals)[:, None])[order], first)
         return gradients
@@ -115,14 +115,14 @@ class Linearised:
 
 @dataclass(frozen=True, kw_only=True)
 class RobustFit(Linearised):
-    """The minimum of a robust least squares problem; jacobian and prior follow the parts' own parameters.
+    """The minimum of a robust least squares problem. Jacobian and prior include that own parameters follow shared ones.
 
     Attributes
     ----------
-    x : (k + p c,) parameters: the k shared ones, then part after part
-    own_prior, own_pull : (p, k, k), (p, k) information and gradient of the priors of each part's own parameters, which
-        follow the shared ones
-    gain : (p, c, k) negative derivative of each part's own parameters by the shared ones
+    x : (k + p c,) the k shared parameters, then the own parameters of part after part
+    own_prior, own_pull : (p, k, k), (p, k) information and gradient by the priors of the own parameters of each part,
+        which follow the shared parameters
+    gain : (p, c, k) negative derivative of the own parameters of each part by the shared parameters
     """
 
     x: Floats
@@ -132,7 +132,7 @@ class RobustFit(Linearised):
 
 
 Evaluate = Callable[[Floats], tuple[Floats, Floats]]
-"""Maps parameters (k + p c,) to residuals (m,) and their Jacobian (m, k + c)."""
+"""Function that returns residuals (m,) and their Jacobian (m, k + c) for parameters (k + p c,)."""
 
 
 def robust_least_squares(
@@ -151,14 +151,14 @@ def robust_least_squares(
 
     Parameters
     ----------
-    evaluate : residuals and Jacobian at some parameters
-    start : (k + p c,) where to begin
-    prior_mean, prior_std : (k + p c,); an infinite deviation is no prior
-    kind : (m,) residuals of one kind share one robust scale, which is their own; default one kind
-    parts : of the data, which have parameters of their own; default one part without
+    evaluate : returns residuals and Jacobian at some parameters
+    start : (k + p c,) parameters at the first step
+    prior_mean, prior_std : (k + p c,); an infinite standard deviation is no prior
+    kind : (m,) kind of each residual; each kind has its own robust scale. Default: one kind
+    parts : parts of the data with their own parameters; default: one part without own parameters
     overlap : number of residuals that count as one independent residual
-    most_steps : at most this many steps
-    settled : length of the last step in standard deviations, all parameters together
+    most_steps : largest number of steps
+    settled : length of a step below which it is the last step, in standard deviations of all parameters together
 
     Notes
     -----
@@ -184,7 +184,7 @@ def robust_least_squares(
             step = step / 2.0
             tried = evaluate(x + step)
         else:
-            # No fraction of the step lowers the cost: with this Jacobian there is no better estimate.
+            # No fraction of the step lowers the cost, so this Jacobian gives no better estimate.
             break
         x, (residuals, jacobian) = x + step, tried
         if before - after < settled**2:
@@ -206,14 +206,14 @@ def robust_least_squares(
 def robust_regression(
     columns: Floats, target: Floats, prior_std: Floats | None = None, overlap: float = 1.0
 ) -> RobustFit:
-    """Return the robust fit of a target (m,) by columns (m, k), with a prior about zero (k,); default none."""
+    """Return the robust fit of a target (m,) by columns (m, k), with a prior about zero (k,); default: no prior."""
     zero = np.zeros(columns.shape[1])
     std = np.full(len(zero), np.inf) if prior_std is None else prior_std
     return robust_least_squares(lambda x: (columns @ x - target, columns), zero, zero, std, overlap=overlap)
 
 
 def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
-    """Return the robust standard deviation about zero of each residual's kind (m,); default one kind."""
+    """Return the robust standard deviation about zero (m,) of the kind of each residual; default: one kind."""
     if kind is None:
         return np.full(len(residuals), max(mad_std(residuals, 0.0), SMALLEST_SCALE))
     scale = np.empty(len(residuals))
@@ -225,27 +225,28 @@ def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:
 
 
 def robust_weights(residuals: Floats, scale: Floats, overlap: float) -> Floats:
-    """Return the weights (m,) of squared residuals: of the loss, one in `overlap`, over the variance."""
+    """Return the weights (m,) of squared residuals: the weight of the loss, over `overlap` and the variance."""
     weights: Floats = soft_l1_weights(residuals / scale) / overlap / scale**2
     return weights
 
 
 def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None = None) -> Floats:
-    """Return the covariance (k, k) of a robust fit; no variance is below the bound of its information.
+    """Return the covariance (k, k) of a robust fit; no variance is below its bound by the information.
 
     Parameters
     ----------
-    group : (m,) residuals of one group depend on one another, others do not
-    group_std : (k,) expected standard deviation of the parameters of a group about the common ones; it counts as one
-        group; None: the groups alone show the spread
+    fit : the fit
+    group : (m,) group of each residual; only residuals of one group depend on each other
+    group_std : (k,) expected standard deviation of the parameters of a group about the common parameters, which counts
+        as one further group; None: the spread comes from the groups alone
 
     Notes
     -----
     H^-1 (sum g g^T + P) H^-1 with g the gradient of a group, H the Gauss-Newton matrix and P the prior (White 1982;
-    Liang and Zeger 1986 for groups, with their B / (B - 1)). Few groups show too little spread: no variance is less
-    than the variance in H^-1. If T is the covariance of a group's own parameters about the common ones and A its
-    information, its gradient has the covariance A T A. This is the spread expected with `group_std`, and it is averaged
-    with the spread of the groups.
+    Liang and Zeger 1986 for groups, with their B / (B - 1)). Few groups show too little spread, so no variance is less
+    than the variance in H^-1. If T is the covariance of the parameters of a group about the common parameters, and A
+    its information, then its gradient has the covariance A T A. This is the spread that `group_std` predicts; it is
+    averaged with the spread of the groups.
     """
     expected = None
     if group_std is not None:
@@ -261,7 +262,7 @@ def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None =
     if not (np.diag(sandwich) > 0.0).all():
         # Weights that differ by hundreds of decades give rounding errors.
         sandwich = inverse
-    # exact data that do not separate the parameters leave no finite covariance
+    # Exact data that do not separate the parameters have no finite covariance.
     with np.errstate(over="ignore", invalid="ignore"):
         grown = np.sqrt(np.maximum(1.0, np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300)))
         covariance: Floats = sandwich * np.outer(grown, grown)
@@ -269,14 +270,17 @@ def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None =
 
 
 def _spread(gradients: Floats, expected: Floats | None) -> Floats:
-    """Return the variance (k, k) of the sum of independent gradients (g, k); an expected one counts as one more."""
+    """Return the variance (k, k) of the sum of independent gradients (g, k).
+
+    An expected variance (k, k) counts as one further gradient.
+    """
     count = len(gradients)
     shown: Floats = gradients.T @ gradients * (count / max(count - 1, 1))
     return shown if expected is None else (count * shown + expected) / (count + 1)
 
 
 def _grouped(group: Ints) -> tuple[Ints, Ints]:
-    """Return the rows (m,) group by group, and where each group begins among them (g,)."""
+    """Return the rows (m,) in the order of their groups, and the place of the first row of each group (g,)."""
     order = np.argsort(group, kind="stable")
     return order, np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
 
@@ -286,7 +290,8 @@ def correlated_covariance(fit: Linearised, group: Ints) -> Floats:
 
     Parameters
     ----------
-    group : (m,) stretches in their order
+    fit : the fit
+    group : (m,) stretch of each residual, in order of distance
 
     Notes
     -----
@@ -307,18 +312,20 @@ def correlated_covariance(fit: Linearised, group: Ints) -> Floats:
 
 
 def student_covariance(fit: Linearised, levels: Sequence[Ints]) -> Floats:
-    """Return the covariance (k, k) of a robust fit, so that two standard deviations hold 95.4 % with few groups, too.
+    """Return the covariance (k, k) of a robust fit, with which two standard deviations hold 95.4 % also for few groups.
 
     Parameters
     ----------
-    levels : (m,) independent groups of residuals; then larger groups of those groups, each level with two or more
+    fit : the fit
+    levels : group of each residual (m,): first independent groups, then larger groups of these; each level has two
+        groups or more
 
     Notes
     -----
-    The variance of the gradient is first computed for residuals that are independent but for their overlap. Then, level
-    by level, it is the spread between groups, and the variance of the level below counts as one further group. The
-    spread is an estimate too: Student's t (1908), expanded about the normal quantile 2 (Abramowitz and Stegun 1964,
-    26.7.5).
+    The variance of the gradient is first computed for independent residuals with an overlap. At each level it becomes
+    the spread between the groups; the variance of the level below counts as one further group. The spread is an
+    estimate, too, so it is multiplied by Student's t (1908), expanded about the normal quantile 2 (Abramowitz and
+    Stegun 1964, 26.7.5).
     """
     variance = fit.of_data
     for group in levels:
@@ -331,11 +338,11 @@ def student_covariance(fit: Linearised, levels: Sequence[Ints]) -> Floats:
 
 
 def long_run_factor(series: Floats) -> Floats:
-    """Return by how much the variance of a sum exceeds the sum of squares (k,), for correlated series (n, k).
+    """Return the ratio (k,) of the variance of the sum of correlated values to the sum of their squares.
 
     Parameters
     ----------
-    series : in order, about zero
+    series : (n, k) values in their order, about zero
 
     Notes
     -----

@@ -486,7 +486,7 @@ class Pool:
         self.overlap = max(float(self.length_m.sum()) / len(RESIDUAL_KINDS) / covered_m, 1.0)
 
     def prior(self, model: MotionModel) -> tuple[Floats, Floats]:
-        """Return prior mean and standard deviation of all parameters: of the model, then constants of each recording."""
+        """Return prior mean and standard deviation of all parameters: of the model, then of the constants."""
         constants_std = np.tile(constant_std(model), len(self.windows))
         mean = np.concatenate([model.prior_mean, np.zeros(len(constants_std))])
         return mean, np.concatenate([model.prior_std, constants_std])
