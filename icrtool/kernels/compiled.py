@@ -1,12 +1,12 @@
-"""One decorator for every compiled kernel, and where its machine code is kept.
+"""The decorator of compiled kernels, and the place of their machine code.
 
-numba compiles a kernel when it is first called on a computer. The object file is kept, and later processes run it
-through llvmlite, the library below numba, because to import numba takes longer than all other imports of a command:
-0.6 s of CPU and 64 MB for each command.
+numba compiles a kernel when it is first called on a computer. The object file is kept, and later processes run it by
+llvmlite, the library below numba, because the import of numba takes longer than all other imports of a command: 0.6 s
+of CPU and 64 MB.
 
-The machine code is called as numba calls it, which numba does not publish. Therefore a small kernel is compiled and
-compared with Python before anything is kept (`passes_as_expected`). Where it differs, or a part of numba that is not
-public is missing, kernels are plain ``numba.njit(cache=True)``.
+The machine code is called as numba calls it, and numba does not publish this calling convention. Therefore a small
+kernel is compiled and compared with Python before any code is kept (`passes_as_expected`). If the results differ, or if
+a part of numba that is not public is missing, kernels are plain ``numba.njit(cache=True)``.
 """
 
 from __future__ import annotations
@@ -37,17 +37,16 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Result = float | None
 
 _OPTIONS = {"nogil": True, "error_model": "numpy"}
-"""``error_model="numpy"`` makes a division by zero an inf, as in the NumPy twins, and lets loops vectorise; ``nogil``
-lets another thread read files while a kernel runs."""
+"""Options of every kernel. With ``error_model="numpy"`` a division by zero gives inf, as in NumPy, and loops can be
+vectorised. With ``nogil`` another thread can read files while a kernel runs."""
 
 _BARE = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
-"""Options of machine code that `Kernel` calls itself. The wrappers for calls from Python and C are left out: they take
-a fifth of the compile time. Reference counts of arrays (``_nrt``) are left out, because no kernel allocates an array:
-they took a third of the filter's time."""
+"""Options of machine code that `Kernel` calls itself. The wrappers for calls from Python and C, which take a fifth of
+the compile time, are left out. Reference counts of arrays (``_nrt``), which took a third of the filter's time, are left
+out, because no kernel allocates an array."""
 
 _MATHEMATICS = {"atan2", "ceil", "cos", "exp", "floor", "fmod", "hypot", "log", "pow", "sin", "sqrt", "tan"}
-"""Functions of the C library, which every process has. Machine code that calls other functions needs numba in the
-process."""
+"""Functions of the C library, which every process has. Machine code that calls any other function needs numba."""
 
 _POINTER, _INTEGER, _FLOAT, _BOOL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_bool
 _ARRAY_FORM = (_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER)
@@ -64,30 +63,30 @@ _RESULTS = {"none": None, "int64": _INTEGER, "float64": _FLOAT}
 """C types of results by the name of their type in numba."""
 
 _DEBUGGING = ("NUMBA_BOUNDSCHECK", "NUMBA_DEBUGINFO")
-"""Settings of numba with which machine code is slower: it is not kept for later processes."""
+"""Settings of numba for debugging. Machine code that is compiled with one of them is slower, and is not kept."""
 
 _RETURNED = (0, -2)
-"""Status codes of machine code that raised no exception: with a result, and with None."""
+"""Status codes of machine code that raised no exception: it returned a number, or None."""
 
 _watchers: list[Callable[[], None]] = []
-"""Called when numba begins to compile a kernel, which happens once on a computer."""
+"""Functions that are called when numba begins to compile a kernel, which happens once on a computer."""
 
 _parts: list[Callable[..., Any]] = []
 _lock = threading.RLock()
 
 
 def _is_set(name: str) -> bool:
-    """Return whether a setting of numba's is on."""
+    """Return whether a setting of numba is on."""
     return os.environ.get(name, "0") not in {"", "0"}
 
 
 class _Arguments:
-    """Arguments in the form that machine code of numba takes.
+    """Arguments of a call, in the form that machine code of numba takes.
 
     Attributes
     ----------
     types : types that the machine code depends on, one for each array, tuple and number
-    words, forms : the values in order, tuples unpacked, and their C types
+    words, forms : the values in order, with tuples unpacked, and their C types
     """
 
     def __init__(self, values: Sequence[object]) -> None:
@@ -98,13 +97,14 @@ class _Arguments:
             self._add(value)
 
     def _add(self, value: object) -> None:
+        """Append an argument."""
         if isinstance(value, np.ndarray):
             if not value.flags.carray:
                 raise TypeError("a kernel takes arrays that are contiguous and can be written")
             # This takes a tenth of the time of `ctypes.data`; only an array without elements needs `ctypes.data`.
             address = ctypes.addressof(_BYTE.from_buffer(cast(Any, value))) if value.size else value.ctypes.data
             self.types.append((value.dtype, value.ndim))
-            # The words of an array: owner, parent, size, size of an item, address, shape, strides.
+            # The words of an array are: owner, parent, size, size of an item, address, shape, strides.
             self.words += (None, None, value.size, value.itemsize, address, *value.shape, *value.strides)
             self.forms += _ARRAY_FORM + (_INTEGER,) * (2 * value.ndim)
         elif isinstance(value, tuple):
@@ -131,7 +131,7 @@ entries."""
 
 
 def _is_object(content: bytes) -> bool:
-    """Return whether bytes are an object file, of ELF a complete one: LLVM crashes on an incomplete file."""
+    """Return whether bytes are an object file. A file in ELF must be complete, because LLVM crashes otherwise."""
     if not content.startswith(_OBJECT_MAGICS) or len(content) < _ELF_SECTIONS.size:
         return False
     if not content.startswith(_OBJECT_MAGICS[0]):
@@ -141,7 +141,7 @@ def _is_object(content: bytes) -> bool:
 
 
 def _is_own(place: Path) -> bool:
-    """Return whether no other user may write a file or folder: machine code that is kept there is executed."""
+    """Return whether no other user can write a file or folder, because machine code in it is executed."""
     if not hasattr(os, "geteuid"):
         return True
     status = place.stat()
@@ -149,20 +149,20 @@ def _is_own(place: Path) -> bool:
 
 
 class MachineCode(NamedTuple):
-    """A compiled kernel: the name of its function, its type of result (a key of `_RESULTS`), the object file."""
+    """A compiled kernel: name of its function, type of its result (a key of `_RESULTS`), and object file."""
 
     name: str
     result: str
     content: bytes
 
     def written(self) -> bytes:
-        """Return the bytes of its file: a digest of the rest, a line for each text, the object file."""
+        """Return the bytes of its file: a digest of all that follows, name and type as lines, and the object file."""
         rest = b"\n".join([self.name.encode(), self.result.encode(), self.content])
         return hashlib.sha256(rest).digest() + rest
 
     @classmethod
     def read(cls, file: Path) -> MachineCode | None:
-        """Return the kernel that a file holds; None where the file is missing or damaged."""
+        """Return the kernel in a file; None if the file is missing or damaged, or if another user can write it."""
         with suppress(OSError, ValueError):
             data = file.read_bytes() if _is_own(file) and _is_own(file.parent) else b""
             if hashlib.sha256(data[32:]).digest() == data[:32]:
@@ -172,7 +172,7 @@ class MachineCode(NamedTuple):
         return None
 
     def function(self, forms: Sequence[Any]) -> Callable[[Sequence[object]], Result]:
-        """Return a function that runs the code on the words of its arguments, which have these C types."""
+        """Return a function that runs the code on words of arguments; `forms` are their C types."""
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
         engine.add_object_file(llvm.ObjectFileRef.from_data(self.content))
         engine.finalize_object()
@@ -180,6 +180,7 @@ class MachineCode(NamedTuple):
         result = _RESULTS[self.result]
 
         def call(words: Sequence[object], _: object = engine) -> Result:
+            """Return the result of the code; the default argument keeps the engine in memory."""
             returned, raised = (result or _INTEGER)(), _POINTER()
             if run(ctypes.byref(returned), ctypes.byref(raised), *words) not in _RETURNED:
                 raise RuntimeError(f"{self.name} raised an exception: kernels must not")
@@ -196,7 +197,7 @@ class Kernel:
     Attributes
     ----------
     py_func : the plain Python function
-    compiled : how often numba compiled it in this process
+    compiled : number of times that numba compiled it in this process
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -206,7 +207,7 @@ class Kernel:
         functools.update_wrapper(self, function)
 
     def __call__(self, *values: object) -> Result:
-        """Run the machine code for arguments of these types; the Python function where ``NUMBA_DISABLE_JIT`` is 1."""
+        """Run the machine code for arguments of these types; if ``NUMBA_DISABLE_JIT`` is 1, run the Python function."""
         if self._runs_python:
             return cast(Result, self.py_func(*values))
         arguments = _Arguments(values)
@@ -221,14 +222,14 @@ class Kernel:
 
     @functools.cached_property
     def _by_numba(self) -> Callable[..., Result]:
-        """Return the function as numba itself calls and keeps it."""
+        """The function as numba itself calls and keeps it."""
         with _lock:
             return _plain_njit(self.py_func)
 
     def _function(
         self, types: tuple[object, ...], values: Sequence[object], arguments: _Arguments
     ) -> Callable[[Sequence[object]], Result] | None:
-        """Return a function that runs the machine code, kept or made now; None where numba alone can run it."""
+        """Return a function that runs machine code, kept or compiled now; None if only numba can run it."""
         name = f"{self.py_func.__module__.rpartition('.')[2]}.{self.py_func.__qualname__}"
         file = f"{name}-{hashlib.sha256(repr((_stamp(), types)).encode()).hexdigest()[:24]}.o"
         for place in cache_places() if _stamp() else ():
@@ -247,7 +248,7 @@ class Kernel:
 
 
 def _loaded(code: MachineCode | None, forms: Sequence[Any]) -> Callable[[Sequence[object]], Result] | None:
-    """Return a function that runs machine code; None where there is none, or this llvmlite cannot load it."""
+    """Return a function that runs machine code; None without code, or if this llvmlite cannot load it."""
     try:
         return code and code.function(forms)
     except Exception:  # noqa: BLE001 - whatever the reason, numba runs the kernel
@@ -264,7 +265,7 @@ def machine_code(function: Callable[..., Any], values: Sequence[object], forms: 
     Returns
     -------
     MachineCode or None
-        None where this version of numba differs from the expected versions, and where the machine code needs numba.
+        None if this version of numba differs from the expected versions, or if the machine code needs numba.
     """
     try:
         return _machine_code(function, values, forms)
@@ -273,6 +274,7 @@ def machine_code(function: Callable[..., Any], values: Sequence[object], forms: 
 
 
 def _machine_code(function: Callable[..., Any], values: Sequence[object], forms: Sequence[Any]) -> MachineCode | None:
+    """Return the result of `machine_code`, or raise any error."""
     numba = _numba()
     dispatcher = numba.njit(**_BARE)(function)
     dispatcher.compile(tuple(numba.typeof(_writable(value)) for value in values))
@@ -305,12 +307,12 @@ class _Example(NamedTuple):
 
 
 def _scaled(weight: float, factor: float) -> float:
-    """Return a product: a part of a kernel."""
+    """Return a product. It is a part of the tested kernel."""
     return weight * factor
 
 
 def _fill(sums: np.ndarray[Any, Any], example: _Example, count: int, factor: float, shift: float | None) -> float:
-    """Fill `sums` (m, 2); return its last number: a kernel with an argument of each kind."""
+    """Fill `sums` (m, 2) and return its last number. It is the tested kernel, with an argument of each kind."""
     for i in range(sums.shape[0]):
         for j in range(sums.shape[1]):
             sums[i, j] = count * _scaled(example.weights[i], factor) + 10 * i + j
@@ -322,7 +324,7 @@ def _fill(sums: np.ndarray[Any, Any], example: _Example, count: int, factor: flo
 
 
 def _clear(sums: np.ndarray[Any, Any]) -> None:
-    """Set all numbers to 0: a kernel without a result."""
+    """Set all numbers to 0. It is the tested kernel without a result."""
     sums[:] = 0.0
 
 
@@ -352,10 +354,10 @@ def _gives_the_same(function: Callable[..., Any], *given: object) -> bool:
 
 
 def _plain_njit(function: Callable[..., Any]) -> Callable[..., Result]:
-    """Return a function as ``numba.njit(cache=True)`` makes it; without the cache where no place can be written.
+    """Return a function as ``numba.njit(cache=True)`` makes it; without the cache if no place can be written.
 
-    Numba looks only at the file of the function to see whether it has changed. Therefore the name of the folder depends
-    on the sources of all kernels.
+    Numba compares only the file of the function to find a change. Therefore the name of the folder depends on the
+    sources of all kernels.
     """
     numba, place, stamp = _numba(), writable_place(), _stamp()
     _mark_parts()
@@ -374,7 +376,7 @@ def _plain_njit(function: Callable[..., Any]) -> Callable[..., Result]:
 
 @contextmanager
 def watched(watch: Callable[[], None]) -> Iterator[None]:
-    """Have `watch` called whenever numba begins to compile a kernel inside the block."""
+    """Call `watch` whenever numba begins to compile a kernel in the block."""
     _watchers.append(watch)
     try:
         yield
@@ -383,7 +385,7 @@ def watched(watch: Callable[[], None]) -> Iterator[None]:
 
 
 def _writable(value: object) -> object:
-    """Return a value of the type that is compiled for: an array that can be written, a number of Python's."""
+    """Return an example of the type that is compiled for: an array that can be written, or a plain Python number."""
     if isinstance(value, np.ndarray):
         return np.empty((0,) * value.ndim, value.dtype)
     if isinstance(value, tuple):
@@ -395,8 +397,8 @@ def _writable(value: object) -> object:
 def _numba() -> ModuleType:
     """Return numba, loaded without scipy's BLAS.
 
-    The search for BLAS takes longer than the rest of the import. No kernel multiplies matrices; numba searches again
-    when a function of another package does.
+    The search for BLAS takes longer than the rest of the import, and no kernel multiplies matrices. Numba searches
+    again if a function of another package does.
     """
     numba = importlib.import_module("numba")
     blas = "scipy.linalg.cython_blas"
@@ -411,19 +413,20 @@ def _numba() -> ModuleType:
 
 
 def _mark_parts() -> None:
-    """Register the parts of kernels that were marked until now."""
+    """Register the parts of kernels that were marked before this call."""
     options = _BARE if passes_as_expected() else _OPTIONS
     while _parts:
         _mark(_parts.pop(), options)
 
 
 def _mark(part: Callable[..., Any], options: Mapping[str, object]) -> None:
+    """Register a function as a part that numba compiles with the kernels that call it."""
     extending = importlib.import_module("numba.extending")
     extending.overload(part, jit_options=dict(options), strict=False, prefer_literal=True)(lambda *_: part)
 
 
 def _machine(level: int = 0) -> llvm.TargetMachine:
-    """Return the compiler's target: this processor, with a level of optimisation."""
+    """Return the target of the compiler: the processor of `processor`, with a level of optimisation."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = processor()
@@ -433,7 +436,7 @@ def _machine(level: int = 0) -> llvm.TargetMachine:
 
 
 def processor() -> tuple[str, str]:
-    """Return the name of the processor that is compiled for, and its features.
+    """Return name and features of the processor that is compiled for.
 
     Numba's settings for both apply; ``NUMBA_ENABLE_AVX`` applies only to code that numba itself runs.
     """
@@ -446,23 +449,22 @@ def processor() -> tuple[str, str]:
 def _stamp() -> tuple[str, ...]:
     """Return the texts that machine code depends on: sources of all kernels, compiler, target and processor.
 
-    The sources of all kernels count, because the machine code of a kernel holds the kernels that it calls.
-
-    Empty where nothing is to be kept: the kernels' sources cannot be read, or numba compiles for a debugger.
+    The sources of all kernels count, because the machine code of a kernel holds the kernels that it calls. The result
+    is empty if no code is kept, because the sources cannot be read or numba compiles for debugging.
     """
     files = sorted(Path(__file__).parent.rglob("*.py"))
     if not files or any(map(_is_set, _DEBUGGING)):
         return ()
     numba = find_spec("numba")
     if numba is not None and numba.origin is not None:
-        # The version of numba, without importing numba.
+        # This file holds the version of numba, which is then not imported.
         files += Path(numba.origin).parent.glob("_version.py")
     sources = hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
     return sources, llvmlite.__version__, llvm.get_default_triple(), *processor()
 
 
 def cache_places() -> list[Path]:
-    """Return where machine code may be kept: ``NUMBA_CACHE_DIR``, else a folder of the package, or the user's cache."""
+    """Return the places of machine code: ``NUMBA_CACHE_DIR``, else a folder of the package, then the user's cache."""
     if named_place := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(named_place)]
     places = [Path(__file__).parent / "__pycache__"]
@@ -474,7 +476,7 @@ def cache_places() -> list[Path]:
 
 
 def writable_place() -> Path | None:
-    """Return the first place that can be written, created if it is missing; None where no place can be written."""
+    """Return the first place that can be written, made if it is missing; None if no place can be written."""
     for place in cache_places():
         with suppress(OSError):
             place.mkdir(parents=True, exist_ok=True)
@@ -484,11 +486,11 @@ def writable_place() -> Path | None:
 
 
 def _keep(name: str, content: bytes) -> None:
-    """Write a file to the cache; if that fails (full disk, no place to write), only this process uses the code."""
+    """Write a file to the cache; if it cannot be written (full disk), only this process uses the code."""
     place = writable_place()
     if place is None:
         return
-    # Other users may read the file: one user builds an image, another user runs it.
+    # Other users may read the file, because one user may build an image that another user runs.
     temporary = place / f"{name}.{os.urandom(8).hex()}"
     with suppress(OSError):
         try:
@@ -499,28 +501,28 @@ def _keep(name: str, content: bytes) -> None:
 
 
 def njit(function: Function) -> Function:
-    """Compile `function` with numba when it is first called; its machine code is kept where it can be.
+    """Return a kernel that numba compiles when it is first called; its machine code is kept.
 
     Notes
     -----
-    Where no place for it is writable (read-only containers, CI sandboxes), it is compiled once a process.
+    If no place can be written (read-only containers, CI sandboxes), it is compiled once in each process.
     """
     return cast(Function, Kernel(function))
 
 
 def njit_part(function: Function) -> Function:
-    """Mark a function as part of kernels: compiled with those that call it, plain Python where Python calls it.
+    """Mark a function as a part of kernels: it is compiled with the kernels that call it; otherwise it is plain Python.
 
     Notes
     -----
-    Numba takes a plain number in a call as a constant, and compiles one copy of the function for each number.
+    Numba treats a plain number in a call as a constant, and compiles a copy of the function for each number.
     """
     _parts.append(function)
     return function
 
 
 def all_kernels() -> Iterator[Kernel]:
-    """Import every module of kernels; yield each compiled function once."""
+    """Import every module of kernels, and yield each kernel once."""
     package = importlib.import_module(__name__.rpartition(".")[0])
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
         for value in vars(importlib.import_module(module.name)).values():

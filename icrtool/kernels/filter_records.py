@@ -13,17 +13,18 @@ Codes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
-"""Outcome of a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
+"""Codes of the outcome of a measurement: outside of the run, used, rejected by the gate, used to end a lock-out."""
 
 GUARDED, UNGUARDED, PRINTED = 0, 1, 2
-"""Sign guards (Section 5.1): Eqs. 32-34 with their derivatives; Eqs. 8-10; Eqs. 32-34 with derivatives as printed.
+"""Sign guards (Section 5.1): Eqs. 32-34 with their derivatives; no guard, Eqs. 8-10; Eqs. 32-34 with Eqs. 28-29 as
+printed.
 
-`PRINTED` divides by W, but differentiates y_r - y_l (Eq. 28 with the difference of Eqs. 32-34 put in).
+`PRINTED` divides by W, but differentiates y_r - y_l (Eq. 28 with the difference of Eqs. 32-34).
 """
 
 REFERENCE_STEP_S = 0.01
-"""Step of the paper's filter, which propagates at 100 Hz [s]. Its process noise dt^2 Q per step is 0.01 s * Q per
-second."""
+"""Step of the paper's filter, which propagates at 100 Hz [s]. Its process noise of dt^2 Q for each step is 0.01 s * Q
+for each second."""
 
 
 class FilterParameters(NamedTuple):
@@ -34,17 +35,19 @@ class FilterParameters(NamedTuple):
     process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
     rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q; for the ICRs, dt is multiplied by the speed of
         the wheels over 1 m/s
-    step_heading : share of a step's turn that is added to the heading before the displacement is rotated into the
-        world: 0 for the heading at the start (Euler, Eq. 14), 0.5 for the middle, the direction of an arc's chord
-    gnss_gate, heading_gate : largest NIS accepted; inf accepts all
-    heading_correlation : number of heading samples that count as one: the errors of neighbours are correlated
+    step_heading : share of the turn of a step that is added to the heading before the displacement is rotated into the
+        world: 0 for the heading at the start (Euler, Eq. 14), 0.5 for the heading in the middle, the direction of the
+        chord of an arc
+    gnss_gate, heading_gate : largest accepted NIS; inf accepts all
+    heading_correlation : number of heading samples that count as one, because the errors of consecutive samples are
+        correlated
     antenna_forward, antenna_right : lever arm of the antenna [m], body frame
-    wheel_gap_s : a longer interval between wheel samples is not dead-reckoned
-    gap_speed_variance, gap_turn_variance : growth through such a gap [m^2/s, rad^2/s]
-    recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
-    icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
-    least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: no limit
-    guard : sign guard of the kinematics, one of the above: PRINTED in preset ``paper``, UNGUARDED in studies only
+    wheel_gap_s : interval between wheel samples above which there is a gap, which is not dead-reckoned [s]
+    gap_speed_variance, gap_turn_variance : growth of the variances of position and heading in a gap [m^2/s, rad^2/s]
+    recovery_count, recovery_s : smallest number and duration of agreeing rejected measurements that end a lock-out
+    icr_inflation_m2 : smallest ICR variances after a terrain change (Section 5.2)
+    least_icr : y_icr_right stays above this limit, y_icr_left below its negative [m]; -inf: no limit
+    guard : sign guard of the kinematics; `PRINTED` in preset ``paper``, `UNGUARDED` only in studies
     """
 
     process_variance: tuple[float, float, float, float, float, float]
@@ -66,7 +69,7 @@ class FilterParameters(NamedTuple):
 
 
 class FilterInputs(NamedTuple):
-    """Inputs of one run: times [s] since any one epoch, non-decreasing.
+    """Inputs of one run; times are non-decreasing [s] since a common epoch.
 
     Attributes
     ----------
@@ -74,8 +77,8 @@ class FilterInputs(NamedTuple):
     gnss_t : (m,); gnss_z : (m, 2) north, east [m]; gnss_r : (m, 2) var north, var east [m^2]
     heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
     change_t : (c,) times of terrain changes
-    slipping : (n,) intervals [k, k+1) in a slip event; empty for none
-    turn_variance : (n,) further growth of the heading's variance over [k, k+1) [rad^2/s]; empty for none
+    slipping : (n,) whether the interval [k, k+1) lies in a slip event; empty: no interval
+    turn_variance : (n,) further growth of the variance of the heading over [k, k+1) [rad^2/s]; empty: no growth
     """
 
     wheel_t: Floats
@@ -93,7 +96,7 @@ class FilterInputs(NamedTuple):
 
 
 class FilterOutput(NamedTuple):
-    """Results of a run for each recorded state, fix and heading; the run fills them in place.
+    """Results of a run for each recorded state, fix and heading. The run fills the arrays in place.
 
     Attributes
     ----------
@@ -101,7 +104,7 @@ class FilterOutput(NamedTuple):
     gnss_code : (m,) outcome of each fix: `UNSEEN`, `USED`, `GATED` or `RECOVERED`
     gnss_nis : (m,) normalised innovation squared; gnss_det : (m,) determinant of S [m^4]; both NaN where unseen
     gnss_residual : (m, 2) fix minus estimate after the update, north and east [m]
-    heading_code, heading_nis : (h,) the same of each heading; heading_innovation : (h,) before the update [rad]
+    heading_code, heading_nis : (h,) outcome and NIS of each heading; heading_innovation : (h,) innovation [rad]
     P : (6, 6) covariance at the end
     P_at_stops : (s, 6, 6) covariance at the requested rows
     """
@@ -119,7 +122,7 @@ class FilterOutput(NamedTuple):
 
     @classmethod
     def empty(cls, data: FilterInputs, rows: int) -> FilterOutput:
-        """Return the output of a run that records `rows` states, before it has run."""
+        """Return the empty output of a run that records `rows` states."""
         m, h = len(data.gnss_t), len(data.heading_t)
         shapes = (m, m, (m, 2), h, h)
         nis, det, residual, heading_nis, innovation = (np.full(shape, np.nan) for shape in shapes)
@@ -153,12 +156,12 @@ class Events(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """The state from which a run continues after the events before. It is changed in place.
+    """The state of a run between two events. It is changed in place.
 
     Attributes
     ----------
-    reached : (2,) time [s], and path length up to there [m]
-    rejected : (2, 4) rows of `rejected_run`, of GNSS and of heading
+    reached : (2,) time [s], and path length until then [m]
+    rejected : (2, 4) argument `run` of `rejected_run`, for fixes and for headings
     x : (6,); P : (6, 6)
     """
 
@@ -178,7 +181,7 @@ class FilterState(NamedTuple):
 
 
 class Space(NamedTuple):
-    """Memory of kernels, which allocate none: PH (6,); G (3, 4), as in `step_jacobian`; T (3, 6)."""
+    """Space of kernels, which allocate no memory: PH (6,); G (3, 4), as in `step_jacobian`; T (3, 6)."""
 
     PH: Floats
     G: Floats
@@ -186,7 +189,7 @@ class Space(NamedTuple):
 
     @classmethod
     def empty(cls) -> Space:
-        """Return new memory."""
+        """Return new space."""
         return cls(np.empty(6), np.empty((3, 4)), np.empty((3, 6)))
 
 

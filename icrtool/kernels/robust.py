@@ -107,7 +107,7 @@ class Linearised:
         return self.of_data + self.prior
 
     def gradients(self, group: Ints) -> Floats:
-        """Return the gradient (g, k) of the data of each group, in their order; `group` (m,) is the group of each residual."""
+        """Return the gradient (g, k) of the data of each group; `group` (m,) is the group of each residual."""
         order, first = _grouped(group)
         gradients: Floats = np.add.reduceat((self.jacobian * (self.weights * self.residuals)[:, None])[order], first)
         return gradients

@@ -1,4 +1,4 @@
-"""Wheels and reference of one drive along time; windows of driven distance, and open-loop trials, cut from it."""
+"""Wheels and reference of one drive along time, and windows of driven distance and open-loop trials of it."""
 
 from __future__ import annotations
 
@@ -18,32 +18,33 @@ LONGEST_DELAY_S = 1.0
 """Longest delay of the wheels with respect to the reference [s]."""
 
 SHORT, GAP, OUTAGE, STANDING, JUMP = -1, -2, -3, -4, -5
-"""Codes in place of the row at which a trial ends, all negative. `SHORT`: the drive ends before. `GAP`: a gap in the
-wheel data. `OUTAGE`: no reference at the end. `STANDING`: the robot stands at the start, and another start counts for
-this standstill. `JUMP`: the reference jumps in between."""
+"""Negative codes of starts without a trial, in place of the row at which the trial ends. `SHORT`: the drive ends
+before. `GAP`: the wheel data have a gap. `OUTAGE`: there is no reference at the end. `STANDING`: the robot stands at
+the start, and another start counts for this standstill. `JUMP`: the reference jumps in between."""
 
 
 class Track(NamedTuple):
-    """Wheels and reference of one drive, each on its own clock, seconds since any one epoch.
+    """Wheels and reference of one drive, each with its own times [s] since a common epoch.
 
-    In a track of recorded states (`Track.of_states`) all clocks are the same, and every column has a row for each
-    state.
+    In a track of recorded states (`Track.of_states`) all times are the same, and every column has a row for each state.
 
     Attributes
     ----------
-    t : (n,) begin of each wheel sample; held : (n,) how long it holds [s], 0 over gaps and for the last one
+    t : (n,) begin of each wheel sample; held : (n,) time for which it holds [s], 0 over gaps and for the last sample
     v_left, v_right : (n,) [m/s], constant for the time `held`
     place_t : (m,); north, east : (m,) position of the reference [m]
     heading_t : (h,); heading : (h,) of the reference [rad], unwrapped, clockwise from north
     distance : (m,) path length at the positions [m], non-decreasing
-    in_outage : (m,) positions that are no reference to compare with
-    jump, slipping : (m,) intervals after a position in which the reference jumps, or that lie in a slip event
-    gyro : (n,) turn rate while a wheel sample holds [rad/s], read when the reference turns; None without one
-    into : share of a wheel sample's time after which its heading is taken: 0 for Euler steps, (k - 1) / 2k for k joined
-        samples
-    place_std_m : standard deviation of the positions on each axis [m]; 0 where it is not needed
-    same_clock : position and heading are fields of the same messages
-    measured_t : (k,) times of measured headings, where the wheels carry them in between; None: each one is measured
+    in_outage : (m,) positions that nothing can be compared with
+    jump, slipping : (m,) whether the reference jumps in the interval after each position, and whether this interval
+        lies in a slip event
+    gyro : (n,) turn rate while a wheel sample holds [rad/s], with the delay of the reference; None without a gyro
+    into : share of the time of a wheel sample after which its heading is taken: 0 for Euler steps, (k - 1) / 2k for k
+        joined samples
+    place_std_m : standard deviation of the positions on each axis [m]; 0 if it is not needed
+    same_clock : whether position and heading are fields of the same messages
+    measured_t : (k,) times of the measured headings, between which the wheels carry the heading; None: all headings are
+        measured
     """
 
     t: Floats
@@ -70,7 +71,7 @@ class Track(NamedTuple):
         cls, t: Floats, held: Floats, v_left: Floats, v_right: Floats, north: Floats, east: Floats, heading: Floats,
         distance: Floats, *, in_outage: Bools | None = None, jump: Bools | None = None, slipping: Bools | None = None,
     ) -> Self:  # fmt: skip
-        """Return the track of states, every column (n,); no flags: there are none."""
+        """Return the track of states, every column (n,); flags that are not given are False."""
         outage, jumps, slips = (
             np.zeros(len(t), np.bool_) if flags is None else flags for flags in (in_outage, jump, slipping)
         )
@@ -93,7 +94,7 @@ class Track(NamedTuple):
 
     @property
     def nose(self) -> Complexes:
-        """Heading as a unit vector in the middle of each wheel sample (n,)."""
+        """Heading as a complex unit vector in the middle of each wheel sample (n,)."""
         return np.asarray(np.exp(1j * np.interp(self.t + self.held / 2, self.heading_t, self.heading)))
 
     @property
@@ -103,7 +104,7 @@ class Track(NamedTuple):
 
     @property
     def travel(self) -> Floats:
-        """Mean distance of the sides until each wheel sample (n,) [m]; backward counts as forward does."""
+        """Mean distance of the sides until each wheel sample (n,) [m]; driving backward increases it, too."""
         speed = np.abs(self.v_left)
         speed += np.abs(self.v_right)
         speed /= 2.0
@@ -126,7 +127,7 @@ class Track(NamedTuple):
         return self.at_places(np.asarray(self.mean_speed * self.nose))
 
     def heading_at(self, t: Floats) -> Floats:
-        """Return the heading at some times."""
+        """Return the heading (k,) [rad] at times (k,) [s]."""
         return np.interp(t, self.heading_t, self.heading)
 
     @property
@@ -135,7 +136,7 @@ class Track(NamedTuple):
         return self.heading_t if self.measured_t is None else self.measured_t
 
     def clear(self, begin_s: Floats, end_s: Floats) -> Bools:
-        """Return which spans of time (w,) hold no gap in the wheel data."""
+        """Return which spans of time (w,) have no gap in the wheel data."""
         gap_t = self.gap_t
         return np.asarray(np.searchsorted(gap_t, begin_s) == np.searchsorted(gap_t, end_s))
 
@@ -151,7 +152,7 @@ class Track(NamedTuple):
         return self._replace(t=self.t[rows], held=self.held[rows], v_left=left, v_right=right, gyro=gyro)
 
     def rows_around(self, begin_s: float, end_s: float) -> slice:
-        """Return the wheel samples from a begin to an end, with `LONGEST_DELAY_S` more on both sides."""
+        """Return the rows of the wheel samples in a span, extended by `LONGEST_DELAY_S` on both sides."""
         edges = [begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S]
         first, stop = np.searchsorted(self.t, edges, side="right").tolist()
         return slice(max(first - 1, 0), stop)
@@ -161,10 +162,14 @@ class Track(NamedTuple):
         return self.wheels(self.rows_around(begin_s, end_s))
 
     def joined(self, first: Ints, into: float = 0.0) -> Self:
-        """Return the track with the wheel samples from each row in `first` on joined to one: means over their time."""
+        """Return the track with the wheel samples from each row of `first` to the next joined to one sample.
+
+        A joined sample has the means over its time. `into` is the field of the same name.
+        """
         held = np.add.reduceat(self.held, first)
 
         def mean(column: Floats, over_gaps: Floats) -> Floats:
+            """Return the mean of a column over the time of each joined sample; `over_gaps` where this time is 0."""
             total = np.add.reduceat(self.held * column, first)
             return np.divide(total, held, out=over_gaps, where=held > 0.0)
 
@@ -173,7 +178,7 @@ class Track(NamedTuple):
         return self._replace(t=self.t[first], held=held, v_left=left, v_right=right, gyro=gyro, into=into)
 
     def gyro_change(self, part: slice = slice(None)) -> Floats:
-        """Return the change of the gyro's turn rate by time [rad/s^2], of some wheel samples (n,); 0 without a gyro."""
+        """Return the derivative of the gyro's turn rate [rad/s^2] at some wheel samples; 0 without a gyro."""
         rows = np.arange(*part.indices(len(self.t)))
         if self.gyro is None:
             return np.zeros(len(rows))
@@ -189,9 +194,9 @@ class Windows:
 
     Attributes
     ----------
-    track : the track that they are cut from; its wheel samples may have been joined since
-    begin, end : (w,) rows of its positions, first and last of a window
-    length_m : (w,) distance [m], nominal
+    track : track of the windows; its wheel samples may have been joined
+    begin, end : (w,) rows of the first and the last position of each window
+    length_m : (w,) nominal distance [m]
     """
 
     track: Track
@@ -200,7 +205,7 @@ class Windows:
     length_m: Floats
 
     def over(self, at_places: Rate) -> Rate:
-        """Return the change over each window (w,) of a quantity that is given at the positions (m,)."""
+        """Return the change over each window (w,) of a quantity at the positions (m,)."""
         return at_places[self.end] - at_places[self.begin]
 
     @cached_property
@@ -211,7 +216,7 @@ class Windows:
 
     @cached_property
     def moved(self) -> Complexes:
-        """Displacement of the reference (w,), forward + j right in the body frame of the begin [m]."""
+        """Displacement of the reference (w,), forward + j right in the body frame at the begin [m]."""
         return np.asarray(np.exp(-1j * self.track.heading_at(self.track.place_t[self.begin])) * self.seen)
 
     @cached_property
@@ -222,10 +227,12 @@ class Windows:
 
 
 def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Windows:
-    """Return windows of driven distance of a drive; no window crosses a gap, jump or slip event, or ends in an outage.
+    """Return windows of driven distance; no window crosses a gap, jump or slip event, or ends in an outage.
 
     Parameters
     ----------
+    track : track of the drive
+    lengths_m : lengths of the windows [m]
     every_m : distance between the starts of windows of one length [m]
     """
     lengths, begins = np.asarray(lengths_m, np.float64), rows_at_steps(track.distance, every_m)
@@ -233,7 +240,7 @@ def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Windows:
     ends = ends_from(track, lengths, begins)
     column, row = np.nonzero(ends.T >= 0)
     begin, end = begins[row], ends[row, column].astype(np.int64)
-    # the number of slipping rows before both ends is the same: none lies between them
+    # If the number of slipping rows before both ends is the same, no slipping row lies between them.
     slips = np.flatnonzero(track.slipping)
     quiet = np.searchsorted(slips, begin) == np.searchsorted(slips, end)
     return Windows(track, begin[quiet], end[quiet], lengths[column][quiet])
@@ -244,7 +251,7 @@ def fill_ends(
     distance: Floats, place_t: Floats, in_outage: Bools, gap_t: Floats, jumps: Ints, horizons_m: Floats, starts: Ints,
     ends: Rows,
 ) -> None:  # fmt: skip
-    """Fill `ends` (h, k) of `ends_from`; the last begin of a gap and the last row of a jump are beyond all."""
+    """Fill `ends` (h, k) for `ends_from`; the last items of `gap_t` and `jumps` must lie after the drive."""
     rows = len(distance)
     for h in range(len(horizons_m)):
         end, gap, jump = 0, 0, 0
@@ -274,12 +281,13 @@ def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Rows:
     Parameters
     ----------
     horizons_m : (h,) distances [m], in any order
-    starts : (k,) rows from which to go, ascending
+    starts : (k,) rows at which the distances begin, ascending
 
     Returns
     -------
-    (k, h), one horizon contiguous: the first row j with ``distance[j] - distance[start] >= horizon``, or `SHORT`,
-    `GAP`, `OUTAGE`, `JUMP`.
+    int32 (k, h)
+        The first row j with ``distance[j] - distance[start] >= horizon``, or `SHORT`, `GAP`, `OUTAGE`, `JUMP`; each
+        horizon contiguous.
     """
     ends = np.empty((len(horizons_m), len(starts)), np.int32)
     columns = (track.distance, track.place_t, horizons_m)
@@ -290,7 +298,7 @@ def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Rows:
 
 
 class FrozenIcrs(NamedTuple):
-    """The ICRs a trial from state k drives with. Each of shape (n,), or (1,) for one triple from every start.
+    """ICRs with which the trial from each state is predicted; (n,) each, or (1,) for one triple for all states.
 
     Attributes
     ----------
@@ -303,7 +311,7 @@ class FrozenIcrs(NamedTuple):
 
     @classmethod
     def constant(cls, y_icr_right: float, y_icr_left: float, x_icr: float) -> FrozenIcrs:
-        """Return one triple [m] for every start: no-slip is ``(b/2, -b/2, 0)``."""
+        """Return one triple [m] for all states; without slip it is ``(b/2, -b/2, 0)``."""
         return cls(np.array([y_icr_right]), np.array([y_icr_left]), np.array([x_icr]))
 
 
@@ -316,7 +324,7 @@ class OpenLoopPath(NamedTuple):
 
 
 class TrialCounts(NamedTuple):
-    """Number of starts with a trial, and of starts without a trial by reason; int64 (n_horizons,) each."""
+    """Numbers of starts with a trial, and of starts without a trial by reason; int64 (n_horizons,) each."""
 
     trials: Ints
     short: Ints
@@ -327,11 +335,11 @@ class TrialCounts(NamedTuple):
 
 
 def trial_ends(track: Track, horizons_m: Floats, lo: int = 0, hi: int | None = None) -> Rows:
-    """Return `ends_from` of all starts in [lo, hi), by default of all states."""
+    """Return the result of `ends_from` for all starts in [lo, hi); default: all states."""
     return ends_from(track, horizons_m, np.arange(lo, len(track.distance) if hi is None else hi))
 
 
 def count_trials(ends: Rows) -> TrialCounts:
-    """Return the number of trials, and of starts without a trial by reason, from `ends` (n_starts, n_horizons)."""
+    """Return the numbers of trials, and of starts without a trial by reason, from `ends` (n_starts, n_horizons)."""
     kinds = np.array([np.bincount(-column[column < 0], minlength=1 - JUMP) for column in ends.T]).T
     return TrialCounts(len(ends) - kinds.sum(axis=0), *kinds[-np.array([SHORT, GAP, OUTAGE, STANDING, JUMP])])

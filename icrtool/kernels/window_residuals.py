@@ -1,8 +1,8 @@
 """Paths of a motion model that is linear in its parameters, and residuals of windows of a path, with derivatives.
 
-With z = forward + j right, heading Theta and place S are sums over steps, and a window from knot s to knot e displaces
-the robot, in the body frame of its start, by d = e^{-j Theta_s} (S_e - S_s). omega is linear in the parameters, so
-d Theta / d theta does not depend on them; cumulative sums over the steps give both and their derivatives.
+With z = forward + j right, heading Theta and place S are sums over the steps. A window from knot s to knot e displaces
+the robot, in the body frame of its start, by d = e^{-j Theta_s} (S_e - S_s). omega is linear in the parameters theta,
+so d Theta / d theta does not depend on them. Cumulative sums over the steps give Theta, S and their derivatives.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ VX, VY, OMEGA = 0, 1, 2
 """Axes of the body twist."""
 
 Twists = Callable[[slice], tuple[Floats, Ints, Floats]]
-"""Returns for a slice of n steps: the twist without the free terms (3, n), v_x, v_y [m/s], omega [rad/s]; the axis of
-each free term (k,); the twist per unit of each parameter (k, n)."""
+"""Function that returns for a slice of n steps: the twist without the free terms (3, n), v_x, v_y [m/s], omega [rad/s];
+the axis of each free term (k,); the twist per unit of each parameter (k, n)."""
 
 
 class PathKnots(NamedTuple):
-    """A path at knots, and its derivatives by k terms; place and velocity are forward + j right in its own frame.
+    """A path at knots, and its derivatives by k terms: place and velocity are forward + j right in the first frame.
 
     Attributes
     ----------
     heading, turn_rate : (m,) [rad, rad/s]; place, velocity : complex (m,) [m, m/s]; the rates are 0 over gaps
-    heading_by : (k, m); place_by : complex (k, m)
+    heading_by : (k, m) derivatives of the heading; place_by : complex (k, m) derivatives of the place
     """
 
     heading: Floats
@@ -57,12 +57,13 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
 
     Parameters
     ----------
-    twists : called for some steps at a time, because the columns of a long drive would take much memory
-    parameters : (k,) of the free terms
+    track : track of the drive
+    twists : returns the twists of some steps; all steps of a long drive would need much memory
+    parameters : (k,) parameters of the free terms
     at : (m,) time of each knot [s], ascending
     """
     k, m = len(parameters), len(at)
-    # The step in which each time lies, and the time since its begin; in a gap the speeds end with the step.
+    # These are the step of each knot and the part of the step before it. In a gap the speeds end with the step.
     row = np.maximum(np.searchsorted(track.t, at, side="right") - 1, 0)
     held = track.held[row]
     part = np.divide(np.clip(at - track.t[row], 0.0, held), held, out=np.zeros(m), where=held > 0.0)
@@ -105,20 +106,20 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
         moved_by = by * forward
         moved_by[turning] = (turned_by[:, :-1] + ahead * columns[turning]) * moved
         sums = sums_from(place_by, moved_by)
-        # a turn and a velocity to the right move it at right angles to what is summed here
+        # Turns, and velocities to the right, move the place at right angles to the summed direction.
         knots.place_by[:, here] = (sums[:, step] + share * moved_by[:, step]) * direction
         heading_by, place_by = turned_by[:, -1], sums[:, -1]
     return knots
 
 
 def displacements(path: PathKnots, start: Ints, end: Ints) -> tuple[Complexes, Complexes]:
-    """Return how far windows (w,) of a path move, forward + j right in the body frame of their start, and derivatives.
+    """Return the displacements (w,) of windows of a path, forward + j right in the body frame of their start [m].
 
-    The derivatives (k + 1, w) are by the terms, and by a delay of the knots [s].
+    The second result is their derivatives (k + 1, w) by the terms, and by a delay of the knots [s].
     """
     back, moved = np.exp(-1j * path.heading[start]), path.place[end] - path.place[start]
     by = np.empty((len(path.heading_by) + 1, len(start)), np.complex128)
-    # the derivative of e^{-j Theta_s} times the displacement is -j dTheta_s times it
+    # The factor e^{-j Theta_s} adds -j dTheta_s times the displacement to the derivatives.
     by[:-1] = path.place_by[:, end] - path.place_by[:, start] - 1j * path.heading_by[:, start] * moved
     by[-1] = path.velocity[end] - path.velocity[start] - 1j * path.turn_rate[start] * moved
     return back * moved, back * by
@@ -135,8 +136,8 @@ def window_residuals(
     Parameters
     ----------
     start, end : (w,) knots of each window; reference : complex (w,) displacement [m]; root : (w,) [m^0.5]
-    offset : added to the reference's heading [rad]
-    shortened : (w,) mean displacement of a path whose heading wanders, over its displacement without wandering
+    offset : angle that is added to the reference's heading [rad]
+    shortened : (w,) ratio of the mean displacement with a wandering heading to the displacement without
     """
     moved, by = displacements(path, start, end)
     turned = np.exp(-1j * offset) * reference
