@@ -11,7 +11,7 @@ from icrtool.records.measurements import Fixes, LogFacts, SensorData
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples
 
 START_NS = 1_760_000_000_000_000_000
-RATE_HZ, SECONDS, WIDTH_M = 100, 120.0, 0.6
+RATE_HZ, SECONDS, WIDTH_M = 40, 120.0, 0.6
 Y_RIGHT, Y_LEFT, X = 0.55, -0.5, 0.1
 Slip = Callable[[Floats], Floats]
 """Shares missed by left and right, and speed sideways [m/s], at times (n,): (3, n)."""

@@ -16,7 +16,7 @@ from icrtool.records.tables import RobotLog
 from support.drives import EPOCH_NS
 from support.matrix_filter import drive_states
 
-WIDTH_M, ICRS, RATE_HZ, SECONDS = 0.8, (0.7, -0.7, 0.05), 50.0, 300.0
+WIDTH_M, ICRS, RATE_HZ, SECONDS = 0.8, (0.7, -0.7, 0.05), 25.0, 300.0
 CONFIG = load_config(sets=[f"robot.track_width_m={WIDTH_M}"])
 
 
@@ -45,10 +45,10 @@ def log_of(seed: int, odometry: str, tau_s: float = 1.0) -> RobotLog:
         angle, wheels = np.cumsum(true), np.cumsum(turn)
         turn = np.diff(low_passed(angle, tau_s) + wheels - low_passed(wheels, tau_s), prepend=0.0)
     elif odometry == "slipping":
-        turn = turn + 0.5 * np.repeat(rng.normal(size=len(t) // 25), 25)
+        turn = turn + 0.5 * np.repeat(rng.normal(size=len(t) // 12), 12)[: len(t)]
     elif odometry == "late":
         turn, v = (np.interp(t - tau_s, t, one) for one in (turn, v))
-    stamps, rows = EPOCH_NS + np.round(t * 1e9).astype(np.int64), slice(None, None, 5)
+    stamps, rows = EPOCH_NS + np.round(t * 1e9).astype(np.int64), slice(None, None, 3)
     count = len(stamps[rows])
     variance = np.full(count, 0.01**2)
     north_east = states[rows, :2].T + rng.normal(0.0, 0.01, (2, count))

@@ -24,7 +24,7 @@ def with_changes(changes: list[tuple[float, float]], seconds: float, seed: int =
 
     The sides' difference is divided by it, their mean kept: the same path with other wheels.
     """
-    log = make_log(seed, seconds=seconds)
+    log = make_log(seed, seconds=seconds, rate=20.0)
     t = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
     left, right = log.wheels.v_left_mps, log.wheels.v_right_mps
     width = ICRS[0] - ICRS[1]
@@ -45,7 +45,7 @@ def with_change(factor: float, at_s: float, seconds: float = 240.0) -> RobotLog:
 
 
 def test_the_wheels_of_an_unchanged_ground_are_those_of_the_log() -> None:
-    log, same = make_log(seconds=240.0), with_change(1.0, 120.0)
+    log, same = make_log(seconds=240.0, rate=20.0), with_change(1.0, 120.0)
     np.testing.assert_allclose(same.wheels.left, log.wheels.left, rtol=0, atol=1e-12)
     np.testing.assert_allclose(same.wheels.right, log.wheels.right, rtol=0, atol=1e-12)
 
@@ -67,7 +67,7 @@ def test_a_change_is_named_with_its_time_and_both_multipliers(factor: float, at_
 
 
 def test_a_drive_on_one_ground_shows_no_change() -> None:
-    run = fit(make_log(seconds=240.0), CONFIG)
+    run = fit(make_log(seconds=240.0, rate=20.0), CONFIG)
     assert run.document.wheels.ground_change_s is None
     assert run.document.partly_because is None
     assert run.document.wheels.turn_unexplained is not None
@@ -105,4 +105,4 @@ def test_two_and_three_changes_are_named_each_with_its_stretch(changes: list[tup
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_drive_on_one_ground_has_one_stretch(seed: int) -> None:
-    assert fit(make_log(seed, seconds=340.0), CONFIG).document.wheels.ground_stretches == ()
+    assert fit(make_log(seed, seconds=340.0, rate=20.0), CONFIG).document.wheels.ground_stretches == ()

@@ -66,7 +66,7 @@ def after_parking(sensors: SensorData, seconds: float = 300.0) -> SensorData:
     parked = START_NS + np.rint(np.arange(seconds * RATE_HZ) / RATE_HZ * 1e9).astype(np.int64)
     later, n, rng = round(seconds * 1e9), len(parked), np.random.default_rng(9)
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
-    m, still = len(parked[::5]), np.zeros(n)
+    m, still = len(parked[:: RATE_HZ // 20]), np.zeros(n)
 
     def joined(first: Floats, then: Floats) -> Floats:
         return np.concatenate([first, then])
@@ -78,7 +78,7 @@ def after_parking(sensors: SensorData, seconds: float = 300.0) -> SensorData:
             joined(still, wheels.v_left_mps), joined(still, wheels.v_right_mps),
         ),
         fixes=Fixes(
-            np.concatenate([parked[::5], fixes.stamp_ns + later]),
+            np.concatenate([parked[:: RATE_HZ // 20], fixes.stamp_ns + later]),
             joined(rng.normal(0, 0.01, m), fixes.north_m), joined(rng.normal(0, 0.01, m), fixes.east_m),
             *(np.concatenate([np.full(m, one[0]), one]) for one in (
                 fixes.var_north_m2, fixes.var_east_m2, fixes.fix_class, fixes.misreported, fixes.down_weighted,

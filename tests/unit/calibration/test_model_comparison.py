@@ -40,6 +40,17 @@ def run() -> Run:
     return fit(make_log(0, 180.0, rate=20.0), CONFIG)
 
 
+@pytest.fixture(scope="module")
+def with_headings(run: Run) -> tuple[ComparedModels, dict[str, Floats]]:
+    return compared_errors(run, measured_headings(run))
+
+
+@pytest.fixture(scope="module")
+def with_gyro(run: Run) -> tuple[ComparedModels, dict[str, Floats]]:
+    """With a gyro that has a scale and a bias."""
+    return compared_errors(run, [MeasuredHeading("gyro", 0.97 * run.table.heading_rad + 0.01 * run.table.t_s)])
+
+
 def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
     """A gyro that turns as the wheels do with the ICRs: steps along the middle of each turn."""
     table, width = run.table, 1.1
@@ -63,11 +74,12 @@ def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
     assert np.max(np.abs(found[some, 0] - expected)) < CHORD_M
 
 
-def test_a_gyro_is_scaled_and_refused_where_it_does_not_turn(run: Run) -> None:
+def test_a_gyro_is_scaled_and_refused_where_it_does_not_turn(
+    run: Run, with_gyro: tuple[ComparedModels, dict[str, Floats]]
+) -> None:
     heading = run.table.heading_rad
-    gyro = MeasuredHeading("gyro", 0.97 * heading + 0.01 * run.table.t_s)
     _, exact = compared_errors(run, [MeasuredHeading("gyro", heading.copy())])
-    found, scaled = compared_errors(run, [gyro])
+    found, scaled = with_gyro
     assert found.heading == "gyro"
     p95 = [np.nanpercentile(errors["icr_final_gyro"][:, 1], 95) for errors in (exact, scaled)]
     assert p95[1] == pytest.approx(p95[0], abs=0.01)
@@ -76,9 +88,11 @@ def test_a_gyro_is_scaled_and_refused_where_it_does_not_turn(run: Run) -> None:
     assert "does not turn with the robot" in other.notes[0].text
 
 
-def test_a_gyro_of_the_other_sign_is_turned_and_reported(run: Run) -> None:
+def test_a_gyro_of_the_other_sign_is_turned_and_reported(
+    run: Run, with_gyro: tuple[ComparedModels, dict[str, Floats]]
+) -> None:
     angle = 0.97 * run.table.heading_rad + 0.01 * run.table.t_s
-    usual, turned = (compared_errors(run, [MeasuredHeading("gyro", sign * angle)]) for sign in (1, -1))
+    usual, turned = with_gyro, compared_errors(run, [MeasuredHeading("gyro", -angle)])
     known = {one.text for one in usual[0].notes}
     assert {one.text for one in turned[0].notes} - known == {
         "the gyro counts turns in the other direction; its sign was changed"
@@ -87,8 +101,8 @@ def test_a_gyro_of_the_other_sign_is_turned_and_reported(run: Run) -> None:
         assert np.allclose(errors, turned[1][name], atol=ROUNDING_M, equal_nan=True)
 
 
-def test_all_rows_have_errors_in_the_same_trials(run: Run) -> None:
-    found, errors = compared_errors(run, measured_headings(run))
+def test_all_rows_have_errors_in_the_same_trials(with_headings: tuple[ComparedModels, dict[str, Floats]]) -> None:
+    found, errors = with_headings
     assert list(errors) == [
         "controller", "recommended", "no_slip_heading", "controller_heading", "recommended_heading", "icr_heading",
         "icr_final_heading", "adaptive", "adaptive_heading",
@@ -97,8 +111,10 @@ def test_all_rows_have_errors_in_the_same_trials(run: Run) -> None:
         assert np.array_equal(np.isfinite(one), found.table.trials[0].ends >= 0)
 
 
-def test_the_path_of_a_row_ends_where_its_trial_does(run: Run) -> None:
-    found, errors = compared_errors(run, measured_headings(run))
+def test_the_path_of_a_row_ends_where_its_trial_does(
+    run: Run, with_headings: tuple[ComparedModels, dict[str, Floats]]
+) -> None:
+    found, errors = with_headings
     drive, (start, end) = track_of(run), (found.table.trials[0].starts, found.table.trials[0].ends[:, 1])
     for row in found.rows:
         if row.path is None:
@@ -112,8 +128,8 @@ def test_the_path_of_a_row_ends_where_its_trial_does(run: Run) -> None:
 
 
 def test_the_whole_model_predicts_better_than_the_momentary_icrs(run: Run) -> None:
-    report = icrtool.dropout_report(run)
-    p95 = {one.name: float(one.column("p95_m")[9]) for one in report.results}
+    report = icrtool.dropout_report(run, horizons_m=[10.0])
+    p95 = {one.name: float(one.column("p95_m")[0]) for one in report.results}
     # of a robot whose ICRs are constant, momentary ones are as good once they are learned
     assert p95["recommended"] < 1.1 * p95["icr"] < p95["no_slip"]
 
