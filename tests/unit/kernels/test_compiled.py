@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import shutil
@@ -106,34 +105,49 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"lag",
-        b"lag\nnone\n\x7fELF",
-        b"lag\nnone\n\x7fELF" + bytes(900),
-        b"lag\nnone\nno object",
-        b"\xff\nnone\n\x7fELF",
-    ],
+MALFORMED = (
+    b"",
+    b"lag",
+    b"lag\nnone\n\x7fELF",
+    b"lag\nnone\n\x7fELF" + bytes(900),
+    b"lag\nnone\nno object",
+    b"\xff\nnone\n\x7fELF",
 )
-def test_malformed_machine_code_with_the_right_digest_is_not_run(tmp_path: Path, content: bytes) -> None:
-    called(tmp_path)
-    [file] = tmp_path.iterdir()
-    file.write_bytes(hashlib.sha256(content).digest() + content)
-    assert called(tmp_path) == ["1.5", "1", "True"]
+
+CALL_MALFORMED = """
+import hashlib, sys
+from pathlib import Path
+import numpy as np
+from icrtool.kernels.compiled import njit
+from icrtool.kernels.kinematics import lag
+[file] = Path(sys.argv[1]).iterdir()
+whole = file.read_bytes()
+for stored in (whole, *(hashlib.sha256(one).digest() + one for one in map(bytes.fromhex, sys.stdin))):
+    file.write_bytes(stored)
+    kernel, speed = njit(lag.py_func), np.array([1.0, 2.0, 2.0])
+    kernel(speed, np.array([1.0, 0.5]))
+    print(speed[2], kernel.compiled, flush=True)
+"""
 
 
-@pytest.mark.parametrize("place", ["file", "folder"])
-def test_machine_code_that_everybody_may_write_is_not_run(tmp_path: Path, place: str) -> None:
-    called(tmp_path)
-    [file] = tmp_path.iterdir()
-    open_to_all = file if place == "file" else tmp_path
+def test_malformed_machine_code_with_the_right_digest_is_not_run(place: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", CALL_MALFORMED, str(place)], env={**os.environ, "NUMBA_CACHE_DIR": str(place)},
+        input="".join(f"{one.hex()}\n" for one in MALFORMED), capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == ["1.5 0"] + ["1.5 1"] * len(MALFORMED), done.stderr
+    assert done.returncode == 0
+
+
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_machine_code_that_everybody_may_write_is_not_run(place: Path, what: str) -> None:
+    [file] = place.iterdir()
+    open_to_all = file if what == "file" else place
     open_to_all.chmod(0o777)
-    assert called(tmp_path) == ["1.5", "1", "True"]
+    assert called(place) == ["1.5", "1", "True"]
     file.chmod(0o644)
-    tmp_path.chmod(0o700)
-    assert called(tmp_path) == ["1.5", "0", "False"]
+    place.chmod(0o700)
+    assert called(place) == ["1.5", "0", "False"]
 
 
 @pytest.mark.parametrize(

@@ -168,7 +168,7 @@ class Transcription:
 def test_the_estimate_equals_a_plain_transcription(monkeypatch: pytest.MonkeyPatch) -> None:
     """At 10 Hz a step is one sample; the wander of the heading, an estimate of its own, is left out of both."""
     monkeypatch.setattr(adaptive, "FEWEST_FOR_WANDER", 10**9)
-    recording, prior = made_drive(50.0, hz=10.0), prior_of_robots(WIDTH_M)
+    recording, prior = made_drive(40.0, hz=10.0), prior_of_robots(WIDTH_M)
     expected = Transcription(recording, prior).solutions()
     found = AdaptiveModel(prior).observe_all(samples_of(recording))
     assert len(found) == len(expected) > 8
@@ -207,8 +207,9 @@ def test_what_comes_after_the_end_of_a_trial_does_not_change_its_error() -> None
             starts=trials.starts[within], ends=np.where(trials.ends < rows - 1, trials.ends, -1)[within]
         )
         assert np.count_nonzero(some.ends >= 0) > 100
+        drives = whole, adapt(cut, prior)
         for turned in (False, True):
-            errors = [one.errors(some, turned=turned).position for one in (whole, adapt(cut, prior))]
+            errors = [one.errors(some, turned=turned).position for one in drives]
             assert np.nanmax(np.abs(errors[0] - errors[1])) < 1e-9
 
 
