@@ -7,6 +7,7 @@ the spread between single residuals.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -53,8 +54,21 @@ def mad_std(values: Floats, centre: float | None = None) -> float:
     """
     if not len(values):
         return float("nan")
-    middle = float(np.median(values)) if centre is None else centre
-    return MAD_TO_STD * float(np.median(np.abs(values - middle), overwrite_input=True))
+    middle = median_in_place(values.copy()) if centre is None else centre
+    return MAD_TO_STD * median_in_place(np.abs(values - middle))
+
+
+def median_in_place(values: Floats) -> float:
+    """Return the median of values (m,), which are reordered; NaN where one of them is NaN.
+
+    For a few hundred values `np.median` takes four times as long, and fits call it thousands of times.
+    """
+    last, half = len(values) - 1, len(values) // 2
+    first = half if len(values) % 2 else half - 1
+    values.partition((first, half, last))  # NaN is sorted to the end
+    if math.isnan(values[last]):
+        return math.nan
+    return float(values[half] if first == half else (values[first] + values[half]) / 2.0)
 
 
 def soft_l1_loss(z: Floats) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 
@@ -34,6 +35,11 @@ def draw_parameters(model: MotionModel, rng: np.random.Generator) -> Floats:
             return parameters
 
 
+def first_order(kept: float, push: Floats) -> Floats:
+    """Return errors (n,) of which a share is kept from sample to sample, from what is added to each (n,)."""
+    return np.array(list(accumulate(push.tolist(), lambda before, one: kept * before + one)))
+
+
 def make_recording(
     model: MotionModel, parameters: Floats, seed: int = 0, seconds: float = 300.0, *, rate: float = 10.0,
     slip: float = 0.05, noise_m: float = 0.01, noise_rad: float = 0.003, gyro: bool = False, name: str = "made",
@@ -54,9 +60,8 @@ def make_recording(
     v_left, v_right = mean + turn * WIDTH_M / 2, mean - turn * WIDTH_M / 2
     v_x, v_y, omega = twist(model, parameters, wheel_motion(v_left, v_right, WIDTH_M))
     keep = np.exp(-dt)
-    wander = np.zeros((3, n))
-    for k in range(1, n):
-        wander[:, k] = keep * wander[:, k - 1] + rng.normal(0.0, slip * np.sqrt(1.0 - keep**2), 3)
+    push = rng.normal(0.0, slip * np.sqrt(1.0 - keep**2), (n - 1, 3))
+    wander = np.array([first_order(keep, np.append(0.0, one)) for one in push.T])
     v_x, v_y, omega = v_x * (1 + wander[0]), v_y + v_x * wander[1] / 3, omega * (1 + wander[2])
     heading = np.concatenate([[0.3], 0.3 + np.cumsum(dt * omega)[:-1]])
     place = np.concatenate([[0.0], np.cumsum(dt * (v_x + 1j * v_y) * np.exp(1j * heading))[:-1]])

@@ -15,16 +15,15 @@ from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, Stream
 from icrtool.records.tables import RobotLog
 from support.drives import EPOCH_NS
 from support.matrix_filter import drive_states
+from support.recordings import first_order
 
 WIDTH_M, ICRS, RATE_HZ, SECONDS = 0.8, (0.7, -0.7, 0.05), 25.0, 300.0
 CONFIG = load_config(sets=[f"robot.track_width_m={WIDTH_M}"])
 
 
 def low_passed(x: Floats, tau_s: float) -> Floats:
-    from scipy.signal import lfilter
-
     a = 1.0 / (RATE_HZ * tau_s + 1.0)
-    return np.asarray(lfilter([a], [1.0, a - 1.0], x))
+    return first_order(1.0 - a, a * x)
 
 
 def log_of(seed: int, odometry: str, tau_s: float = 1.0) -> RobotLog:

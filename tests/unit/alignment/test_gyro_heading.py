@@ -20,6 +20,7 @@ from icrtool.pipeline import fit
 from icrtool.records.samples import NO_HEADINGS, GyroAxes, HeadingSamples, OtherReceiver
 from icrtool.records.tables import RobotLog
 from support.exact_drives import CONFIG, simulate
+from support.recordings import first_order
 
 LARGEST_RMS_DEG = 0.3
 FIRST_S = 10.0
@@ -47,13 +48,6 @@ def error_deg(samples: HeadingSamples, truth: Truth) -> np.ndarray:
     return np.where(samples.stamp_ns - truth[0][0] < FIRST_S * 1e9, 0.0, error)
 
 
-def first_order(kept: float, push: np.ndarray) -> np.ndarray:
-    """Return errors of which a share is kept from sample to sample, along the last axis."""
-    from scipy.signal import lfilter
-
-    return np.asarray(lfilter([1.0], [1.0, -kept], push))
-
-
 @pytest.mark.parametrize(("axis", "sign"), [(2, -1.0), (2, 1.0), (0, -1.0), (1, 1.0)])
 def test_axis_and_sense_of_the_gyro_are_found(axis: int, sign: float) -> None:
     log, truth = without_heading(1, axis, sign)
@@ -71,7 +65,7 @@ def test_a_gyro_on_its_side_is_found_beside_fixes_that_wander(axis: int, sign: f
     kept = math.exp(-float(np.median(np.diff(fixes.stamp_ns))) / 60e9)
     push = rng.normal(0.0, 0.8 * math.sqrt(1.0 - kept**2), (2, len(fixes.stamp_ns)))
     push[:, 0] = rng.normal(0.0, 0.8, 2)
-    north, east = first_order(kept, push) + rng.normal(0.0, 0.1, push.shape)
+    north, east = np.array([first_order(kept, one) for one in push]) + rng.normal(0.0, 0.1, push.shape)
     variance = np.ones(len(fixes.stamp_ns))
     wandering = replace(
         fixes, north_m=fixes.north_m + north, east_m=fixes.east_m + east, var_north_m2=variance, var_east_m2=variance

@@ -16,6 +16,7 @@ from icrtool.kernels.robust import (
     RobustFit,
     long_run_factor,
     mad_std,
+    median_in_place,
     robust_least_squares,
     robust_weights,
     sandwich_covariance,
@@ -50,6 +51,18 @@ def std_of(found: RobustFit, group: Ints | None = None) -> Floats:
     """Return standard deviations (k,); by default each residual is independent."""
     group = np.arange(len(found.residuals)) if group is None else group
     return np.asarray(np.sqrt(np.diag(sandwich_covariance(found, group))))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 301, 1000])
+def test_the_median_of_fits_is_numpys(count: int) -> None:
+    rng = np.random.default_rng(count)
+    for special in ((), (np.nan,), (np.inf,), (-np.inf, np.inf)):
+        for _ in range(20):
+            values = np.round(rng.normal(size=count), 1) * 10.0 ** rng.uniform(-150.0, 150.0)
+            values[rng.integers(0, count, len(special))] = special
+            with np.errstate(invalid="ignore"):
+                expected, found = np.median(values), median_in_place(values.copy())
+            np.testing.assert_array_equal(found, expected)
 
 
 def test_mad_std_is_the_standard_deviation_of_normal_values_and_ignores_outliers() -> None:

@@ -25,7 +25,16 @@ from icrtool.motion.window_fit import (
     residuals_of,
     shortening_by_wander,
 )
-from support.recordings import FAMILY, WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all, twist
+from support.recordings import (
+    FAMILY,
+    WIDTH_M,
+    draw_parameters,
+    first_order,
+    make_recording,
+    table_errors,
+    trials_from_all,
+    twist,
+)
 
 EIGHT = MODELS["recommended"]
 SEEDS = range(8)
@@ -301,9 +310,8 @@ def test_a_poor_gyro_gives_way_to_the_wheels() -> None:
     poor = []
     for one in logs:
         assert one.track.gyro is not None
-        drift = np.zeros(len(one.track.t))
-        for k in range(1, len(drift)):
-            drift[k] = keep * drift[k - 1] + rng.normal(0.0, 0.05 * np.sqrt(1.0 - keep**2))
+        push = rng.normal(0.0, 0.05 * np.sqrt(1.0 - keep**2), len(one.track.t) - 1)
+        drift = first_order(keep, np.append(0.0, push))
         poor.append(replace(one, track=one.track._replace(gyro=one.track.gyro + drift)))
     table = hold_out(poor)
     weight = table.fits["five_gyro"].parameters[-1]
