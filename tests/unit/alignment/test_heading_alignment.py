@@ -29,7 +29,7 @@ DECLINATION_DEG = -10.55
 
 
 def clean() -> RobotLog:
-    return replace(make_log(2, seconds=140.0), datum=Datum(40.7934, -77.86, 350.0))
+    return replace(make_log(2, seconds=140.0, rate=20.0), datum=Datum(40.7934, -77.86, 350.0))
 
 
 def told(log: RobotLog, psi: Floats) -> RobotLog:

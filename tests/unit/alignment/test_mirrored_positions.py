@@ -21,7 +21,7 @@ DATUM = Datum(49.0, 8.4, 120.0)
 
 def log_of(*, gyro: bool = True, seed: int = 5) -> RobotLog:
     """Return a log with geodetic positions, a heading and a gyro that agree."""
-    exact, log = make_log(seed, 180.0, heading_std_deg=0.0), make_log(seed, 180.0)
+    exact, log = make_log(seed, 180.0, rate=20.0, heading_std_deg=0.0), make_log(seed, 180.0, rate=20.0)
     t = (exact.heading.stamp_ns - EPOCH_NS) / 1e9
     rate = np.gradient(np.unwrap(exact.heading.heading_rad), t)
     rate += np.random.default_rng(seed).normal(0.0, 0.01, len(t))
@@ -110,14 +110,14 @@ def test_metres_per_radian_are_those_of_another_library(latitude_deg: float) -> 
 
 def lawn_log() -> RobotLog:
     """Return straight lines of 20 m with a half turn at each end, to the right and to the left by turns."""
-    t = np.arange(0.0, 360.0, 0.02)
+    t = np.arange(0.0, 360.0, 0.05)
     phase = t % 30.0
     turn = np.where(phase > 24.0, np.pi / 6.0, 0.0) * np.where((t // 30.0) % 2 < 1.0, 1.0, -1.0)
     left, right = 0.8 - ICRS[1] * turn, 0.8 - ICRS[0] * turn
     log, rng = log_of(), np.random.default_rng(0)
-    psi = 0.1 + np.append(0.0, np.cumsum(turn[:-1] * 0.02))
-    step = np.exp(1j * psi) * (0.8 - 1j * ICRS[2] * turn) * 0.02
-    place = np.append(0.0, np.cumsum(step[:-1]))[::5]
+    psi = 0.1 + np.append(0.0, np.cumsum(turn[:-1] * 0.05))
+    step = np.exp(1j * psi) * (0.8 - 1j * ICRS[2] * turn) * 0.05
+    place = np.append(0.0, np.cumsum(step[:-1]))[::2]
     stamps = EPOCH_NS + np.round(t * 1e9).astype(np.int64)
     noise, var = rng.normal(0.0, 0.014, (2, len(place))), np.full(len(place), 0.014**2)
     heading = np.angle(np.exp(1j * (psi + rng.normal(0.0, 0.01, len(t)))))
@@ -126,7 +126,7 @@ def lawn_log() -> RobotLog:
         log,
         wheels=replace(log.wheels, stamp_ns=stamps, left=left, right=right),
         gnss=replace(
-            log.gnss, stamp_ns=stamps[::5], north_m=place.real + noise[0], east_m=place.imag + noise[1],
+            log.gnss, stamp_ns=stamps[::2], north_m=place.real + noise[0], east_m=place.imag + noise[1],
             var_north_m2=var, var_east_m2=var.copy(), cov_north_east_m2=np.zeros(len(place)),
         ),
         heading=replace(log.heading, stamp_ns=stamps, heading_rad=heading, var_rad2=np.full(len(t), 1e-4)),

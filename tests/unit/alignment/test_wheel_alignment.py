@@ -157,7 +157,7 @@ def with_gaps(log: RobotLog, *, every_s: float, gap_s: float, from_position: boo
 
 
 def test_gaps_of_wheels_that_report_positions_are_bridged() -> None:
-    log = make_log(seconds=180.0)
+    log = make_log(seconds=180.0, rate=20.0)
     whole = fit(log, CONFIG)
     runs = [fit(with_gaps(log, every_s=8.0, gap_s=2.0, from_position=kind), CONFIG) for kind in (True, False)]
     counted, open_ = runs
@@ -170,7 +170,9 @@ def test_gaps_of_wheels_that_report_positions_are_bridged() -> None:
     assert counted.table.distance_m[-1] == pytest.approx(whole.table.distance_m[-1], rel=0.01)
     final = counted.summary["icr"]["final"]
     assert (final["y_icr_right_m"], final["y_icr_left_m"]) == pytest.approx(ICRS[:2], abs=ICR_TOLERANCE_M)
-    trials, missing, full = (dropout_report(run, ladder=False).summary for run in (counted, open_, whole))
+    trials, missing, full = (
+        dropout_report(run, horizons_m=[20.0], ladder=False).summary for run in (counted, open_, whole)
+    )
 
     def count(summary):  # type: ignore[no-untyped-def]
         return int(summary.set_index(["model", "horizon_m"]).loc[("icr", 20.0), "trials"])

@@ -22,6 +22,7 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.error_statistics import error_summary
 from icrtool.motion.recording import cut_trials
 from icrtool.output.exports.controllers import format_export
+from icrtool.output.figures import style as figure_style
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.run import Run
 from support.documents import with_summary
@@ -31,7 +32,7 @@ HORIZONS = (5.0, 10.0, 20.0)
 
 @pytest.fixture(scope="module")
 def drive(make_run: Callable[..., Run]) -> Run:
-    run = make_run(duration_s=150.0, troubles=False)
+    run = make_run(duration_s=120.0, troubles=False)
     return with_summary(run, inputs=[{"path": "a", "bytes": 1, "sha256": "a"}])
 
 
@@ -125,7 +126,10 @@ def test_gates_and_budgets_know_every_row(report: DropoutReport) -> None:
     assert all(one.low_m <= one.distance_m <= (one.high_m or np.inf) for one in known)
 
 
-def test_files_and_figures_hold_every_row(report: DropoutReport, tmp_path: Path) -> None:
+def test_files_and_figures_hold_every_row(
+    report: DropoutReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(figure_style, "picture_bytes", lambda figure, form: form.encode())  # drawn, without pixels
     report.write(tmp_path / "dropout")
     rows = {"icr", "no_slip", "icr_final", "controller", "recommended", "adaptive"}
     names = rows | {f"{row}_heading" for row in rows} | {"calibration:own", "calibration:last.season"}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import csv
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import icrtool
+from icrtool.cli.commands import icrtool as command
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
@@ -178,19 +178,15 @@ def test_info_proposes_the_topics_that_can_be_scored(log: Path) -> None:
 
 
 def test_the_command_scores_topics_of_a_log_and_refuses_those_of_a_run(log: Path, tmp_path: Path) -> None:
-    icr = Path(sys.executable).with_name("icrtool")
     options = [part for one in SETS for part in ("--set", one)]
-    base = [str(icr), "dropout-report", str(log), "-o", str(tmp_path / "run"), "--plots", "none", *options]
-    done = subprocess.run([*base, "--score", ODOMETRY, "--score", FUSED], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    base = ["dropout-report", str(log), "-o", str(tmp_path / "run"), "--plots", "none", *options]
+    done = CliRunner().invoke(command, [*base, "--score", ODOMETRY, "--score", FUSED])
+    assert done.exit_code == 0, done.stderr
     assert f"topic:{ODOMETRY}" in done.stdout
     assert f"topic:{ODOMETRY}" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    refused = subprocess.run(
-        [str(icr), "dropout-report", str(tmp_path / "run"), "--score", ODOMETRY],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert refused.returncode == 1
-    assert "name its LOG in place of the run" in refused.stderr
-    proposed = subprocess.run([str(icr), "info", str(log), *options], capture_output=True, text=True, check=False)
+    refused = CliRunner().invoke(command, ["dropout-report", str(tmp_path / "run"), "--score", ODOMETRY])
+    assert refused.exit_code == 1
+    assert "name its LOG in place of the run" in refused.stderr + str(refused.exception)
+    proposed = CliRunner().invoke(command, ["info", str(log), *options])
     assert ODOMETRY in proposed.stdout
     assert "--score" in proposed.stdout

@@ -23,7 +23,7 @@ HORIZONS_M = [5.0, 10.0]
 
 @pytest.fixture(scope="module")
 def run(make_run: Callable[..., Run]) -> Run:
-    return make_run(duration_s=300.0)
+    return make_run(duration_s=200.0)
 
 
 @pytest.fixture(scope="module")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from icrtool.config import load_config
@@ -27,23 +29,30 @@ SECOND_NS = 1_000_000_000
 Again = Callable[[int], list[int]]
 
 
+@functools.cache
+def beginning() -> list[tuple[Schema, Channel, int, bytes]]:
+    """Return the messages of the log's first seconds: type, topic, time since the start [ns] and content."""
+    with LOG.open("rb") as stream:
+        found: list[tuple[Schema, Channel, int, bytes]] = []
+        begin_ns = 0
+        for schema, channel, message in make_reader(stream).iter_messages():
+            begin_ns = begin_ns or message.log_time
+            if message.log_time - begin_ns >= LASTS_NS:
+                break
+            found.append((schema, channel, message.log_time - begin_ns, message.data))
+    return found
+
+
 def record(path: Path, times_of: Again, *, change: bool = False, topic: str = "") -> Path:
     """Write the first 40 s of a log, each message at all log times that `times_of` gives for its time since the start.
 
     `change`: each message differs from the one that it repeats; `topic`: name of all topics, in place of their own.
     """
     kept = []
-    with LOG.open("rb") as stream:
-        begin_ns = 0
-        for schema, channel, message in make_reader(stream).iter_messages():
-            begin_ns = begin_ns or message.log_time
-            if message.log_time - begin_ns >= LASTS_NS:
-                break
-            for number, time_ns in enumerate(times_of(message.log_time - begin_ns)):
-                data = message.data
-                if change and number:
-                    data = data[:-8] + np.float64(number).tobytes()
-                kept.append((time_ns, schema, channel, data))
+    for schema, channel, since_ns, own in beginning():
+        for number, time_ns in enumerate(times_of(since_ns)):
+            data = own[:-8] + np.float64(number).tobytes() if change and number else own
+            kept.append((time_ns, schema, channel, data))
     kept.sort(key=lambda one: one[0])
     with path.open("wb") as sink:
         writer = Writer(sink, compression=CompressionType.ZSTD)

@@ -223,7 +223,7 @@ def test_its_filter_states_its_own_error_after_ten_metres(log: str, robot: str) 
         [(left + right) / 2, np.zeros(len(rows)), (right - left) / (numbers.multiplier * calibration.width_m)]
     )
     missed, stated = [], []
-    for begin in range(0, len(rows), len(rows) // 40):
+    for begin in range(0, len(rows), len(rows) // 25):
         end = int(np.searchsorted(driven, driven[begin] + 10.0))
         if end >= len(rows):
             break
