@@ -17,7 +17,7 @@ import click
 
 from icrtool import __version__
 from icrtool.cli import when_used
-from icrtool.output.text_blocks import Block, Line, Table, fitted_to, format_blocks, printed_parts
+from icrtool.output.text_blocks import Block, Line, Table, fit_table, format_blocks, printed_parts
 from icrtool.records.text import LONGEST_NAME, counted, escaped, listed, shortened
 
 with when_used():
@@ -73,7 +73,7 @@ def _print_table(block: Table, console: Console) -> None:
     from rich.table import Table as RichTable
     from rich.text import Text as RichText
 
-    table, left_out = fitted_to(block, console.width, FEWEST_COLUMNS)
+    table, left_out = fit_table(block, console.width, FEWEST_COLUMNS)
     shown = RichTable(box=None, pad_edge=False, show_header=bool(table.head))
     sides = table.sides()
     for number, side in enumerate(sides):

@@ -117,15 +117,17 @@ def slide(
 
     Notes
     -----
-    Newton and Euler in the body frame with the forces of `contact_forces`, semi-implicit Euler steps of at most
-    `LONGEST_SUBSTEP_S`. The load shifts with the acceleration and the height of the centre of mass.
+    The equations of Newton and Euler in the body frame, with the forces of `contact_forces`, are solved in
+    semi-implicit Euler steps of at most `LONGEST_SUBSTEP_S`. The load shifts with the acceleration and the height of
+    the centre of mass.
     """
     cells, sum_xx, sum_yy = len(grip), 0.0, 0.0
     for i in range(len(contact_x)):
         sum_xx += contact_x[i] * contact_x[i]
         sum_yy += contact_y[i] * contact_y[i]
     north, east, psi = pose[0, 0], pose[0, 1], pose[0, 2]
-    # The state: velocity of the centre of mass, track speeds, commands, acceleration that the load follows, distance.
+    # The state is the velocity of the centre of mass, track speeds, commands, the acceleration that the load follows,
+    # and the distance.
     u, w, omega = 0.0, 0.0, 0.0
     left, right, command_left, command_right = 0.0, 0.0, 0.0, 0.0
     a_x, a_y, driven = 0.0, 0.0, 0.0
@@ -160,10 +162,14 @@ def slide(
             force_x, force_y, moment = contact_forces(
                 v_x, v_y, omega, left, right, per_x, per_y, contact_x, contact_y, grip[cell], body
             )
-            of_x = force_x / body.mass + GRAVITY_MPS2 * slope[k, 0]
-            of_y = force_y / body.mass + GRAVITY_MPS2 * slope[k, 1]
-            a_x, a_y = a_x + (of_x - a_x) * followed, a_y + (of_y - a_y) * followed
-            u, w, omega = u + dt * (of_x + omega * w), w + dt * (of_y - omega * u), omega + dt * moment / body.inertia
+            pull_x = force_x / body.mass + GRAVITY_MPS2 * slope[k, 0]
+            pull_y = force_y / body.mass + GRAVITY_MPS2 * slope[k, 1]
+            a_x, a_y = a_x + (pull_x - a_x) * followed, a_y + (pull_y - a_y) * followed
+            u, w, omega = (
+                u + dt * (pull_x + omega * w),
+                w + dt * (pull_y - omega * u),
+                omega + dt * moment / body.inertia,
+            )
             v_y = w - omega * body.mass_forward
             v_x = u + omega * body.mass_right
             middle = psi + 0.5 * dt * omega
@@ -171,5 +177,5 @@ def slide(
             east += dt * (v_x * math.sin(middle) + v_y * math.cos(middle))
             psi += dt * omega
             driven += dt * math.sqrt(v_x * v_x + v_y * v_y)
-        # The mean speed over the step, which gives the distance that the tracks travelled.
+        # The mean speed over the step gives the distance that the tracks travelled.
         tracks[k, 0], tracks[k, 1] = mean_left, mean_right

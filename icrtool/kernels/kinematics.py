@@ -1,7 +1,8 @@
 """The skid-steer ICR kinematics (Pentzer 2014, Eqs. 8-12, 14, 17, 27-29, 32-34): velocities, one step, its Jacobian.
 
-Also the true motion of a robot with known ICRs. While track speeds and ICRs are constant the body moves on a circle
-(Section 2), so a true step is an arc, not an Euler step: it does not depend on the filter's own steps (Eq. 14).
+The module also computes the true motion of a robot with known ICRs. While track speeds and ICRs are constant the body
+moves on a circle (Section 2). So a true step is an arc, and not an Euler step: it does not depend on the filter's steps
+(Eq. 14).
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def step_jacobian(
     Eq. 14 (Euler where step_heading is 0) and Eqs. 17, 27-29.
     """
     psi, y_r, y_l, x_v = x[2], x[3], x[4], x[5]
-    # W of the sign guard (Section 5.1), and the sign of its derivative by y_r
+    # W is that of the sign guard (Section 5.1); `sign` is the sign of its derivative by y_r.
     W, sign = max(abs(y_l - y_r), MIN_ICR_SEPARATION_M), 1.0
     if y_r < y_l and guard != PRINTED:
         sign = -1.0 if guard == GUARDED else 1.0
@@ -113,7 +114,7 @@ def _arcs(heading: Floats, v_left: Floats, v_right: Floats, icrs: Floats, dt: Fl
 
     Parameters
     ----------
-    heading : (n,) at the begin [rad]; v_left, v_right : (n,) held [m/s]; dt : (n,) how long [s]
+    heading : (n,) at the begin [rad]; v_left, v_right : (n,) held [m/s]; dt : (n,) duration [s]
     icrs : (n, 3) y_icr_right, y_icr_left, x_icr [m]
     """
     v_x, v_y, omega = body_velocity(v_left, v_right, *icrs.T)
@@ -123,7 +124,7 @@ def _arcs(heading: Floats, v_left: Floats, v_right: Floats, icrs: Floats, dt: Fl
 
 
 def drive(t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, which: Ints, start: Floats) -> Floats:
-    """Return the true pose at every time.
+    """Return the true pose of a robot with known ICRs at every time.
 
     Parameters
     ----------
@@ -186,9 +187,9 @@ def model_states(
     noise : (n, 6) standard normal
     """
     dt, left, right = np.diff(wheel_t), v_left[:-1], v_right[:-1]
-    of_pose = np.sqrt(REFERENCE_STEP_S * dt) if rate_invariant else dt
-    of_icrs = of_pose * (np.sqrt(wheel_speed(left, right)) if rate_invariant else 1.0)
-    steps = np.column_stack([of_pose] * 3 + [of_icrs] * 3) * std * noise[:-1]
+    pose_scale = np.sqrt(REFERENCE_STEP_S * dt) if rate_invariant else dt
+    icr_scale = pose_scale * (np.sqrt(wheel_speed(left, right)) if rate_invariant else 1.0)
+    steps = np.column_stack([pose_scale] * 3 + [icr_scale] * 3) * std * noise[:-1]
     icrs = np.cumsum(np.vstack([x0[3:], steps[:, 3:]]), axis=0)
     v_x, v_y, omega = body_velocity(left, right, *icrs[:-1].T)
     psi = np.cumsum(np.append(x0[2], dt * omega + steps[:, 2]))
@@ -198,7 +199,7 @@ def model_states(
 
 
 def chord_rows(north: Floats, east: Floats, step_m: float) -> Ints:
-    """Return rows (c,): the first one, then each first row at least `step_m` away from the row returned before.
+    """Return rows (c,) at least `step_m` apart: the first row, then each time the next row that is so far away.
 
     Parameters
     ----------
@@ -210,6 +211,7 @@ def chord_rows(north: Floats, east: Floats, step_m: float) -> Ints:
 
 @njit
 def _fill(north: Floats, east: Floats, step_m: float, rows: Ints) -> int:
+    """Write the rows of `chord_rows` into `rows` (n,), whose first is row 0, and return their number."""
     count = 1
     for k in range(1, len(north)):
         a, b = north[k] - north[rows[count - 1]], east[k] - east[rows[count - 1]]

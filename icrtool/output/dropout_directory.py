@@ -168,6 +168,7 @@ def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
 
         def append(model: str, horizons_m: Floats, errors_m: Floats) -> None:
+            """Append the trials of a model, whose errors are (n, h) [m]."""
             for h, horizon in enumerate(horizons_m):
                 for lo in range(0, len(stamp_ns), ROWS_A_GROUP):
                     error = errors_m[lo : lo + ROWS_A_GROUP, h]
@@ -278,7 +279,7 @@ class Baseline:
             robots.append(robot)
         theirs = ", ".join(sorted({escaped(robot) for robot, _ in self.kinds.values() if robot})) or "none with a name"
         given = ", ".join(sorted({escaped(robot) for robot in robots if robot})) or "no robot named (--robot)"
-        why = f"neither these logs nor their robot are in it (robots there: {theirs}; asked: {given})"
+        why = f"holds neither these logs nor their robot (robots in it: {theirs}; robots of the logs: {given})"
         raise ConfigError(f"--baseline {self.path}", why, "logs are matched by content, else by name, else by robot")
 
 

@@ -77,17 +77,17 @@ FIGURES = {
     ),
     "icr_estimates": Entry(
         "run", "ICR estimates over time",
-        "Good: the lines settle soon and the bands become narrow. A later step: other ground, or a faulty sensor.",
+        "Good: the lines settle soon and the bands become narrow. A later step: the ground changed, or a sensor fails.",
         "filter_estimates.icr_estimates",
     ),
     "icr_clusters": Entry(
         "run", "Where the ICRs lay",
-        "Good: three narrow peaks. A wide one is ground that changed, or an ICR that the drive hardly shows.",
+        "Good: three narrow peaks. A wide peak: the ground changed, or the drive hardly shows this ICR.",
         "filter_estimates.icr_clusters", further=True,
     ),
     "gnss_difference": Entry(
         "run", "Filter and position reference",
-        "Good: noise about a constant mean. Steps and long deviations are trouble of the receiver or of the clocks.",
+        "Good: noise about a constant mean. Steps and long deviations come from the receiver or from the clocks.",
         "filter_estimates.gnss_difference",
     ),
     "examples_": Entry(
@@ -98,7 +98,7 @@ FIGURES = {
         with_place=True, further=True,
     ),
     "worst": Entry(
-        "report", "The worst trials", "What they share (a turn, a slope, a place) is where the model fails.",
+        "report", "The worst trials", "What they share (a turn, a slope, a place) shows where the model fails.",
         "dropout_paths.dropout_worst", lambda report: ONCE if report.worst else {}, with_place=True,
     ),
     "error_map": Entry(
@@ -118,7 +118,7 @@ FIGURES = {
     ),
     "histogram_": Entry(
         "report", "Errors after {} m, by model",
-        "A panel a model. Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
+        "Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
         "dropout_errors.dropout_histogram", partial(_histograms, together=False), further=True,
     ),
     "summary": Entry(
@@ -129,7 +129,7 @@ FIGURES = {
     ),
     "icrs": Entry(
         "fleet", "Final ICRs of every log",
-        "One robot on one ground should lie on one level; a step is other ground or wear.",
+        "The ICRs of a robot on one ground should lie on one level; a step comes from other ground or from wear.",
         "calibrations.fleet_icrs", lambda fleet: ONCE if fleet.points else {},
     ),
     "errors": Entry(
@@ -152,15 +152,15 @@ def drive_charts(position_word: str) -> tuple[Chart, ...]:
         Chart(
             "map",
             "Map",
-            "Point at the drive: the same moment is marked in the charts. Click on it: the path that each model drives "
-            "from there, by wheel speeds alone for 20 m; the black line is the filter, which had the "
+            "Point at the drive to mark the same moment in the charts. Click on it to see the path that each model "
+            "drives from there, by wheel speeds alone for 20 m; the black line is the filter, which had the "
             f"{position_word}. The closer a coloured end lies to the black one, the better the model.",
         ),
-        Chart("speeds", "Wheel speeds", "Where left and right differ the robot turns: there slip shows."),
+        Chart("speeds", "Wheel speeds", "The robot turns where left and right differ: slip shows there."),
         Chart(
             "icrs",
             icrs.title,
-            f"{icrs.caption} Bands: ±σ. The dotted lines are half the track width: no slip.",
+            f"{icrs.caption} Bands: ±σ. The dotted lines show half the track width: the ICRs without slip.",
         ),
         Chart(
             "differences",
@@ -170,7 +170,7 @@ def drive_charts(position_word: str) -> tuple[Chart, ...]:
         Chart(
             "headings",
             "Heading: measured minus filter",
-            "Good: noise about zero. A long deviation is a compass that is disturbed, or a clock that lags.",
+            "Good: noise about zero. A long deviation comes from a disturbed compass, or from a clock that lags.",
         ),
     )
 

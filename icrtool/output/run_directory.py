@@ -163,20 +163,26 @@ def changed_settings(directory: Path, config: Config, request: FitRequest) -> li
             continue
         for key, value in values.items():
             name = f"{section}.{key}"
-            if name not in left_out and key in stored and not _same(stored[key], value):
-                changes.append(f"{options.get(name, name)} was {_stated(stored[key])}, now {_stated(value)}")
+            if name not in left_out and key in stored and not _is_same(stored[key], value):
+                changes.append(
+                    f"{options.get(name, name)} was {_setting_text(stored[key])}, now {_setting_text(value)}"
+                )
     return changes
 
 
-def _same(stored: object, requested: object) -> bool:
+def _is_same(stored: object, requested: object) -> bool:
+    """Return whether two settings are equal as plain data, in any order of their keys."""
     return json.dumps(plain_value(stored), sort_keys=True) == json.dumps(plain_value(requested), sort_keys=True)
 
 
-def _stated(value: object) -> str:
+def _setting_text(value: object) -> str:
+    """Return a setting as a short text, ``not given`` for a setting without a value."""
     return "not given" if value is None or value == [] else shortened(escaped(str(value)), LONGEST_NAME)
 
 
 class _StoredSettings(Record, frozen=True):
+    """The settings in a run.json."""
+
     config: dict[str, Any]
     request: dict[str, Any] = msgspec.field(default_factory=dict)
     tool_version: str = ""
@@ -269,10 +275,14 @@ def replaced_log(directory: Path, run: Run) -> str | None:
 
 
 class _Inputs(Record, frozen=True):
+    """The inputs in a run.json."""
+
     inputs: tuple[InputFile, ...]
 
 
 class _Sources(Record, frozen=True):
+    """The paths from which the run was made, in the file of its sources."""
+
     made_from: tuple[str, ...] = ()
 
 
@@ -411,11 +421,12 @@ def newest_run(runs: Path) -> Path:
     """
     run_files = [file for file in runs.glob(f"*/{RUN_FILE}") if is_run_directory(file.parent)]
     if not run_files:
-        raise RunError(runs, "no run in it", "name a run directory or a log, or make a run with icrtool fit")
+        raise RunError(runs, "holds no run", "name a run directory or a log, or make a run with icrtool fit")
     return max(run_files, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent
 
 
 def _read_document(directory: Path) -> dict[str, Any]:
+    """Return the content of a run.json of this version, with its texts from the log escaped."""
     try:
         raw = read_regular(Below(directory, RUN_FILE))
     except (OSError, ValueError) as err:

@@ -33,7 +33,7 @@ BREAK_SHARE, BREAK_IN_INTERVALS = 0.01, 5.0
 """Shortest gap over which no line is drawn: the share of the whole time, and the number of usual intervals."""
 
 
-def every_so_many(rows: int, most: float) -> tuple[Ints, int]:
+def evenly_spaced_rows(rows: int, most: float) -> tuple[Ints, int]:
     """Return about `most` of `rows` rows at an equal step and the last row, and the step."""
     every = max(math.ceil(rows / most), 1)
     return np.unique(np.append(np.arange(0, rows, every), rows - 1)), every
@@ -80,7 +80,7 @@ def percentiles(column: Floats, shares: tuple[float, ...]) -> list[float]:
     return [float(value) for value in np.percentile(column[:: 1 + len(column) // SAMPLED_ROWS], shares)]
 
 
-def places(north: Floats, east: Floats, cell_m: float) -> Ints:
+def rows_entering_cells(north: Floats, east: Floats, cell_m: float) -> Ints:
     """Return the rows at which a path enters another cell of a square grid.
 
     Parameters

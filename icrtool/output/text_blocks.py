@@ -2,7 +2,7 @@
 
 A document (a run, a report, a comparison) is a list of blocks. The code that lays blocks out (here, in
 `icrtool.cli.printing` and `icrtool.output.page`) does not depend on runs or reports. A document lists all possible
-blocks; empty blocks are left out of the layout (`stated_blocks`).
+blocks; empty blocks are left out of the layout (`filled_blocks`).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Cell(NamedTuple):
 
     Attributes
     ----------
-    order : sort key of the cell on a page, "" last; None: the text
+    order : sort key of the cell on a page, where "" is last; None: the text is the key
     link, note : on a page, target of its link, and text shown when the pointer is on it
     """
 
@@ -78,7 +78,7 @@ class Table(NamedTuple):
     Attributes
     ----------
     align : ``l`` or ``r`` for each column; the last one holds for the columns after it too
-    rows : a cell a column; a row of a searched table may have fewer cells, of which the last is a sentence
+    rows : one cell for each column; a row of a searched table may have fewer cells, of which the last is a sentence
     head : names of the columns; empty: none
     caption : sentence about the content
     moments : begin of each row [s], which a page shows on its map; empty: no times
@@ -196,12 +196,12 @@ Block = str | Title | Line | Table | Facts | Checks | Items | Figure | Section
 Printed = str | Line | Table
 
 
-def stated_blocks(blocks: Iterable[Block]) -> Iterator[Block]:
+def filled_blocks(blocks: Iterable[Block]) -> Iterator[Block]:
     """Yield the blocks that are not empty, after empty sentences of facts are left out."""
     for block in blocks:
         match block:
             case Section():
-                if (inner := list(stated_blocks(block.blocks))) or block.lead:
+                if (inner := list(filled_blocks(block.blocks))) or block.lead:
                     yield block._replace(blocks=inner)
             case Facts():
                 if rows := [row for row in block.rows if row[1]]:
@@ -232,7 +232,7 @@ GRADE_MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": 
 
 def printed_parts(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:
     """Yield the printed parts of a document: the brief answer in `BRIEF_WIDTH`, or all parts that are not page-only."""
-    for block in stated_blocks(blocks):
+    for block in filled_blocks(blocks):
         if isinstance(block, str | Line):
             yield block
         elif isinstance(block, Title):
@@ -257,13 +257,14 @@ def printed_parts(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed
 
 
 def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
+    """Yield the printed parts of a section: title, labelled answer, blocks."""
     if verbose and (section.blocks or section.label):
         yield ""
         yield from [Line(section.title, "title")] if section.title else []
     if section.label:
         label, text = f"{section.label:{LABEL + 2}}", f"{section.lead} {section.text}".strip()
         yield _sentence(label, text, 3, GRADE_LOOKS[section.grade], verbose=verbose)
-    # a table whose caption is the title that was just printed
+    # A table does not repeat the title that was just printed as its caption.
     titled = section.title if verbose else ""
     yield from printed_parts(
         (
@@ -295,8 +296,8 @@ def _sentence(first: str, text: str, most: int, look: Look = "as is", *, verbose
     return Line("\n".join(_wrap(text, first, " " * len(first), BRIEF_WIDTH, most)) or first.rstrip(), look)
 
 
-def fitted_to(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
-    """Return a table with one line a row, fitted to a width where possible, and the columns that are left out.
+def fit_table(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
+    """Return a table with one line for each row, of a width where possible, and the columns that are left out.
 
     The widest cells of text are shortened first. Then columns are left out, from the middle, until `fewest` are left. A
     last column of text is wrapped, and needs the width of only a few words.
@@ -328,8 +329,9 @@ def fitted_to(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
 
 
 def _table_lines(table: Table) -> Iterator[str]:
+    """Yield the lines of a table in columns; a last column of text is wrapped to `TEXT_WIDTH`."""
     sides = table.sides()
-    table, _ = fitted_to(table, TEXT_WIDTH, len(sides))
+    table, _ = fit_table(table, TEXT_WIDTH, len(sides))
     rows = [[str(cell) for cell in row] for row in ((table.head, *table.rows) if table.head else table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -345,6 +347,7 @@ def _table_lines(table: Table) -> Iterator[str]:
 
 
 def _wrap(text: str, first: str, later: str, width: int = TEXT_WIDTH, most: int | None = None) -> list[str]:
+    """Return a text in lines after `first` and `later`; words are not broken, and more than `most` lines are cut."""
     return textwrap.wrap(
         text, width, initial_indent=first, subsequent_indent=later, break_long_words=False, break_on_hyphens=False,
         max_lines=most, placeholder=" …",
@@ -352,11 +355,12 @@ def _wrap(text: str, first: str, later: str, width: int = TEXT_WIDTH, most: int 
 
 
 def format_markdown(blocks: Iterable[Block]) -> str:
-    """Return all of a document as Markdown: a heading each title and section, an item each sentence."""
+    """Return a document as Markdown: a heading for each title and section, an item for each sentence."""
     return re.sub("\n{3,}", "\n\n", "\n".join(_markdown_lines(blocks))).strip() + "\n"
 
 
 def _markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
+    """Yield the lines of a document as Markdown."""
     for block in blocks:
         if isinstance(block, Title):
             yield from ("", f"## {_escaped_markdown(block.text)}", "", _escaped_markdown(block.facts), "")

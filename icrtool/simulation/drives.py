@@ -39,7 +39,7 @@ LARGEST_SETTING, SMALLEST_SETTING = 1e6, 1e-9
 """Largest and smallest size of a setting of a drive or sensor, in its unit. 0 is allowed where it has a meaning."""
 
 START_NS = 1_760_000_000_000_000_000
-"""Stamp of time 0 [ns]."""
+"""Stamp of time 0 [ns], in October 2025."""
 
 DATUM = (40.7934, -77.86, 350.0)
 """Latitude, longitude [deg] and height [m] of the first pose."""
@@ -76,7 +76,7 @@ class PathPlan:
 
 @dataclass(frozen=True, slots=True)
 class TrackSpeeds:
-    """Track speeds as given: t_s (n,) increasing from 0; v_left_mps, v_right_mps (n,), held until the next row."""
+    """Given track speeds: t_s (n,) increasing from 0; v_left_mps, v_right_mps (n,), held until the next row."""
 
     t_s: Floats
     v_left_mps: Floats
@@ -169,14 +169,14 @@ class Readings:
 
 
 def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
-    """Raise where a plan cannot be driven, or where sensors give too few samples.
+    """Refuse a plan that cannot be driven, and sensors that give too few samples.
 
     Raises
     ------
     ConfigError
         A value is impossible; the error names this value.
     """
-    # Refuse numbers whose samples fill the memory, and numbers that no robot, sensor or drive has.
+    # Numbers are refused whose samples fill the memory, and those that no robot, sensor or drive has.
     for part in (plan, sensors, plan.path, *([] if plan.robot is None else [plan.robot])):
         for name in (each.name for each in fields(part) if not isinstance(part, TrackSpeeds)):
             for number in _numbers_in(getattr(part, name)):
@@ -269,7 +269,7 @@ def drive_plan(plan: DrivePlan, tail_s: float, rng: np.random.Generator | None =
     end = plan.duration_s + tail_s + 2 * plan.step_s
     times_s = plan.path.t_s if isinstance(plan.path, TrackSpeeds) else np.empty(0)
     edges = np.array([time for time, _ in plan.changes])
-    # A division, because k / 100 and j / 20 give the same double for the same time; products may differ.
+    # The times are quotients, because k / 100 and j / 20 give the same double for the same time; products may differ.
     grid = np.arange(math.ceil(end / plan.step_s)) / round(1 / plan.step_s)
     t = np.union1d(grid, np.concatenate([times_s[times_s < end], edges[edges < end]]))
     command_t = t

@@ -53,28 +53,28 @@ CONSISTENCY_WORDS = {"nees": "NEES", "nis_gnss": "NIS of fixes", "nis_heading": 
 """Words for the numbers of study consistency."""
 
 
-# What varies
+# The settings that studies vary follow.
 
 
-def in_preset(request: StudyRequest, preset: str) -> Scenario:
-    """Return the scenario of a request in a preset, before anything is varied."""
+def with_preset(request: StudyRequest, preset: str) -> Scenario:
+    """Return the scenario of a request with a preset, before a setting is varied."""
     return Scenario(request.plan, request.sensors, request.config.with_filter(preset=preset))
 
 
-def by_preset(
+def settings_by_preset(
     change: Callable[[Scenario, Any], Scenario], choices: Sequence[str] = ()
 ) -> Callable[[StudyRequest], Iterator[Setting]]:
     """Return a function that yields a setting for each preset and each choice, or each value of a request.
 
     Parameters
     ----------
-    change : gives the scenario for a preset's scenario and a value
+    change : returns the scenario for a preset's scenario and a value
     """
 
     def vary(request: StudyRequest) -> Iterator[Setting]:
         for preset in request.presets:
             for value in choices or request.paths or request.values:
-                yield Setting(preset, value, change(in_preset(request, preset), value), {"value": value})
+                yield Setting(preset, value, change(with_preset(request, preset), value), {"value": value})
 
     return vary
 
@@ -89,13 +89,13 @@ def with_path(base: Scenario, **path: Any) -> Scenario:
     return replace(base, plan=replace(base.plan, path=replace(cast(PathPlan, base.plan.path), **path)))
 
 
-def at_rate(base: Scenario, rate: float) -> Scenario:
+def with_rate(base: Scenario, rate: float) -> Scenario:
     """Return a scenario with another rate of wheels and heading; a higher rate of the fixes is reduced to it."""
     gnss_rate = min(rate, base.sensors.gnss_rate_hz)
     return with_other_sensors(base, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
 
 
-def from_source(base: Scenario, name: str) -> Scenario:
+def with_speed_source(base: Scenario, name: str) -> Scenario:
     """Return a scenario with encoders, or with motor commands at a low rate that the motors follow with a lag.
 
     The bias is the difference of command and track speed. The drives of both scenarios are the same.
@@ -105,7 +105,7 @@ def from_source(base: Scenario, name: str) -> Scenario:
     return with_other_sensors(base, wheels="commanded", wheel_rate_hz=base.plan.command_rate_hz)
 
 
-def on_circle(base: Scenario, radius: float) -> Scenario:
+def with_circle(base: Scenario, radius: float) -> Scenario:
     """Return a scenario on a circle, with inflation.
 
     The speed of the faster track is the same for all radii. At radius 0 the robot spins; on a wider circle it turns
@@ -116,19 +116,19 @@ def on_circle(base: Scenario, radius: float) -> Scenario:
     return replace(with_path(base, kind="circle", radius_m=radius, speed_mps=speed), inflate=True)
 
 
-def by_start(request: StudyRequest) -> Iterator[Setting]:
+def settings_by_start(request: StudyRequest) -> Iterator[Setting]:
     """Yield a setting for each guard and, on a grid, for each pair of initial y ICRs."""
-    base, initial_x_m = in_preset(request, request.presets[0]), request.config.filter.initial_x_icr_m
+    base, initial_x_m = with_preset(request, request.presets[0]), request.config.filter.initial_x_icr_m
     of_preset = base.config.filter.rules.initial_icrs_m or (0.0, 0.0, 0.0)
     x = initial_x_m if initial_x_m is not None else of_preset[2]
     for (name, guard), right, left in product(GUARDS.items(), request.values, request.values):
         order = "proper start" if right > left else "inverted start" if right < left else ""
         start = {"start_y_icr_right_m": right, "start_y_icr_left_m": left}
-        config = starting_at(base.config, (right, left, x))
+        config = with_initial_icrs(base.config, (right, left, x))
         yield Setting(name, order, replace(base, guard=guard, config=config), start)
 
 
-def by_case(request: StudyRequest) -> Iterator[Setting]:
+def settings_by_case(request: StudyRequest) -> Iterator[Setting]:
     """Yield a setting with a truth drawn from the filter's own model, and one with exact kinematics for each preset.
 
     Notes
@@ -137,14 +137,14 @@ def by_case(request: StudyRequest) -> Iterator[Setting]:
     (Eq. 31), and the filter starts from the prior of the truth. Then NEES and NIS are chi-squared (Bar-Shalom, Li,
     Kirubarajan 2001, Section 5.4). Cases ``paper`` and ``field``: constant ICRs, preset's start.
     """
-    base = in_preset(request, "paper")
-    start = starting_at(base.config, request.plan.icrs_m, initial_icr_std_m=MODEL_ICR_STD_M)
+    base = with_preset(request, "paper")
+    start = with_initial_icrs(base.config, request.plan.icrs_m, initial_icr_std_m=MODEL_ICR_STD_M)
     yield Setting("model", "", replace(base, config=start, model_icr_std_m=MODEL_ICR_STD_M), {})
     for preset in request.presets:
-        yield Setting(preset, "", in_preset(request, preset), {})
+        yield Setting(preset, "", with_preset(request, preset), {})
 
 
-def starting_at(config: Config, icrs_m: Icrs, **settings: float) -> Config:
+def with_initial_icrs(config: Config, icrs_m: Icrs, **settings: float) -> Config:
     """Return the configuration with other initial ICRs, and other settings of the filter."""
     names = ("initial_y_icr_right_m", "initial_y_icr_left_m", "initial_x_icr_m")
     return config.with_filter(**dict(zip(names, icrs_m, strict=True)), **settings)
@@ -159,7 +159,7 @@ def changed_icrs(icrs_m: Icrs, number: int) -> Icrs:
     return 0.8 * right, 1.2 * left, x - 0.1 * width
 
 
-# Which numbers are reported
+# The numbers that studies report follow.
 
 
 def largest(values: Sequence[Any]) -> tuple[Any, ...]:
@@ -203,7 +203,7 @@ ERROR_COLUMN = "error_{icr}_m"
 """Pattern of the names of columns with ICR errors."""
 
 
-def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> Study:
+def study_of_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> Study:
     """Return the study of an error of the track speeds, on a winding path."""
     return Study(
         about=f"ICR error by {word} of the track speeds",
@@ -213,7 +213,7 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
         runs=20,
         values=STUDY_NOISES,
         plan=WINDING,
-        vary=by_preset(lambda base, value: with_other_sensors(base, **{sensors_field: value})),
+        vary=settings_by_preset(lambda base, value: with_other_sensors(base, **{sensors_field: value})),
         measures=(measured.measure_estimates,),
         numbers=(Number("{series}: error of {icr} at {value:g} m/s", ERROR_COLUMN, "spread", "m", paper, largest),),
         title=f"{{value:g}} m/s of {word} moves y right by {{answer}}",
@@ -256,7 +256,7 @@ STUDIES: dict[str, Study] = {
         presets=("paper",),
         runs=200,
         paths=PATHS,
-        vary=by_preset(lambda base, kind: with_path(base, kind=kind)),
+        vary=settings_by_preset(lambda base, kind: with_path(base, kind=kind)),
         measures=(measured.measure_times, measured.measure_estimates, trace(end_s=SHOWN_S)),
         numbers=(Number("{value} ({series}): all three ICRs converged after", "settle_s", "spread", "s", PATH_TIMES),),
         title="Time to settle on a path of kind {value}: {answer}",
@@ -269,7 +269,7 @@ STUDIES: dict[str, Study] = {
         presets=("paper",),
         runs=4,
         values=tuple(2.0 - 0.5 * step for step in range(9)),
-        vary=by_start,
+        vary=settings_by_start,
         measures=(measured.measure_fate, trace()),
         numbers=(
             Number("{series}, {value}: converged", "converged", "percent", "%", START_FATES, STARTS),
@@ -285,8 +285,10 @@ STUDIES: dict[str, Study] = {
         runs=20,
         plan=replace(PLAN, path=PathPlan("figure-eight", speed_mps=0.5, radius_m=1.0), duration_s=525.0),
         changes_s=(175.0, 350.0),
-        vary=by_preset(lambda base, name: replace(base, inflate=name == "inflated"), ("not inflated", "inflated")),
-        measures=(measured.measure_changes, trace(), measured.zoom),
+        vary=settings_by_preset(
+            lambda base, name: replace(base, inflate=name == "inflated"), ("not inflated", "inflated")
+        ),
+        measures=(measured.measure_changes, trace(), measured.trace_change),
         numbers=(
             Number("{series}, {value}: convergence time (10-90 %)", "change*_rise_*_s", "spread", "s", CHANGE_TIMES),
             Number("{series}, {value}: all three stay within 10 % after", "change*_settle_s", "spread", "s"),
@@ -304,7 +306,7 @@ STUDIES: dict[str, Study] = {
         values=tuple(0.25 * step for step in range(9)),
         plan=replace(PLAN, path=PathPlan("circle"), duration_s=60.0),
         changes_s=(20.0,),
-        vary=by_preset(on_circle),
+        vary=settings_by_preset(with_circle),
         measures=(measured.measure_one_change,),
         numbers=(
             Number("{series}: radius {value:g} m: an ICR stays within 10 % after, mean", "settle_*_s", "mean", "s",
@@ -315,14 +317,14 @@ STUDIES: dict[str, Study] = {
         title="Time to settle at radius {value:g} m: {answer}",
         answer=Number("{series}", "settle_s", "median", "s", at=largest),
     ),
-    "input-noise": by_speed_error("noise", "input_noise_mps", "12", "Fig. 12's axis: -1 to 1 m"),
-    "input-bias": by_speed_error("bias", "input_bias_mps", "13", "Fig. 13's axis: -0.1 to 0.02 m"),
+    "input-noise": study_of_speed_error("noise", "input_noise_mps", "12", "Fig. 12's axis: -1 to 1 m"),
+    "input-bias": study_of_speed_error("bias", "input_bias_mps", "13", "Fig. 13's axis: -0.1 to 0.02 m"),
     "input-source": Study(
         about="encoders against commanded speeds",
         figures="11",
         plan=replace(WINDING, command_rate_hz=10.0, motor_lag_s=0.1),
         sensors=replace(IDEAL, input_bias_mps=0.03),
-        vary=by_preset(from_source, ("encoder", "commanded")),
+        vary=settings_by_preset(with_speed_source, ("encoder", "commanded")),
         measures=(measured.measure_estimates, trace()),
         numbers=(Number("{series}: error of {icr}, {value} speeds", ERROR_COLUMN, "spread", "m"),),
         title="Commanded speeds move y right by {answer}",
@@ -336,7 +338,7 @@ STUDIES: dict[str, Study] = {
         runs=20,
         values=(0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
         plan=replace(PLAN, path=PathPlan("lawnmower"), duration_s=300.0),
-        vary=by_preset(lambda base, value: with_other_sensors(base, gnss_std_m=value)),
+        vary=settings_by_preset(lambda base, value: with_other_sensors(base, gnss_std_m=value)),
         measures=(measured.measure_estimates, measured.measure_times, measured.measure_open_loop),
         numbers=(
             Number("no slip: open loop after 10 m, p95", "blind_no_slip_10m_p95_m", "first", "m"),
@@ -359,7 +361,7 @@ STUDIES: dict[str, Study] = {
             PLAN, icrs_m=(0.6, -0.6, 0.0), path=PathPlan(radius_m=5.0), motor_lag_s=0.1, robot=FrictionRobot()
         ),
         sensors=replace(IDEAL, wheels="encoder"),
-        vary=by_preset(lambda base, value: with_path(base, speed_mps=value)),
+        vary=settings_by_preset(lambda base, value: with_path(base, speed_mps=value)),
         measures=(measured.measure_means,),
         numbers=(
             *(
@@ -378,7 +380,7 @@ STUDIES: dict[str, Study] = {
         varied="rate",
         values=(10.0, 20.0, 50.0, 100.0, 200.0),
         sensors=replace(IDEAL, wheels="encoder"),
-        vary=by_preset(at_rate),
+        vary=settings_by_preset(with_rate),
         measures=(measured.measure_estimates,),
         numbers=(
             Number("{series}: {icr} differs between rates by at most", ERROR_COLUMN, "range of means", "m"),
@@ -390,7 +392,7 @@ STUDIES: dict[str, Study] = {
     "consistency": Study(
         about="whether the filter's covariance is right: NEES, NIS, coverage",
         runs=200,
-        vary=by_case,
+        vary=settings_by_case,
         measures=(measured.measure_consistency,),
         numbers=consistency_numbers,
         title="Mean NEES, 6 expected: {answer}",
@@ -419,7 +421,7 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
     Raises
     ------
     ConfigError
-        A request that cannot be driven.
+        The request cannot be driven.
     """
     if not 1 <= request.runs <= MOST_RUNS:
         raise ConfigError("runs", f"{request.runs} is not a number from 1 to {MOST_RUNS:,}")

@@ -228,7 +228,7 @@ class Study:
 
     Attributes
     ----------
-    about : one line
+    about : what the study shows, in one line
     vary : the settings of a request
     measures : functions that measure each run
     numbers : the numbers that are reported for the levels
@@ -270,7 +270,7 @@ class StudyResult:
 
     @property
     def columns(self) -> dict[str, Column]:
-        """One row a run: the CSV."""
+        """The columns of the CSV, which has one row for each run."""
         runs, levels = self.request.runs, self.levels
         columns: dict[str, Column] = {
             name: [level.names[name] for level in levels for _ in range(runs)] for name in levels[0].names
@@ -280,7 +280,7 @@ class StudyResult:
 
     @property
     def findings(self) -> list[StudyNumber]:
-        """Numbers to compare with the paper's."""
+        """The reported numbers, each with the paper's number."""
         numbers = self.study.numbers
         return numbers(self.levels) if callable(numbers) else reported_numbers(numbers, self.levels)
 

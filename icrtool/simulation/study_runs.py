@@ -27,6 +27,7 @@ from icrtool.simulation.drives import DrivePlan, PathPlan, Readings, Sensors
 from icrtool.simulation.truths import Truth
 
 Progress = Callable[[float], None]
+"""Function that is called with the share of the work that is done."""
 
 STOP_EVERY_S = 5.0
 """Time between two rows at which the complete covariance is kept [s]; it is also kept at the end."""
@@ -99,7 +100,7 @@ class StudyRun:
 
     Attributes
     ----------
-    scenario : what was run
+    scenario : the setting that was run
     t_s : (k,) times of the recorded states, on the truth's clock
     v_left : (k,) speed of the left track as the filter got it
     x : (k, 6) states; std : (k, 6) square roots of the diagonal of P
@@ -122,9 +123,11 @@ class StudyRun:
     heading_nis: Floats
 
 
-Found = dict[str, float | Floats]
-Measure = Callable[[StudyRun], Found]
-"""Reduces a run to numbers, or to arrays that have the same shape in all runs of a scenario."""
+RunNumbers = dict[str, float | Floats]
+"""Numbers and arrays of a run, by name."""
+
+Measure = Callable[[StudyRun], RunNumbers]
+"""Function that reduces a run to numbers, or to arrays that have the same shape in all runs of a scenario."""
 
 
 def run_scenarios(
@@ -146,8 +149,8 @@ def run_scenarios(
         drives.check_drive(scenario.plan, scenario.sensors)
     jobs = [(scenario, run) for scenario in scenarios for run in range(runs)]
 
-    def work(job: tuple[Scenario, int]) -> Found:
-        run = _filtered(*job, seed)
+    def work(job: tuple[Scenario, int]) -> RunNumbers:
+        run = _filter_run(*job, seed)
         return {name: value for measure in measures for name, value in measure(run).items()}
 
     done = []
@@ -160,7 +163,8 @@ def run_scenarios(
     return [{name: np.array([found[name] for found in results]) for name in results[0]} for results in of_scenarios]
 
 
-def _filtered(scenario: Scenario, run: int, seed: int) -> StudyRun:
+def _filter_run(scenario: Scenario, run: int, seed: int) -> StudyRun:
+    """Return run number `run` of a scenario, simulated and filtered."""
     simulate = _simulate if scenario.model_icr_std_m is None else _simulate_model
     readings, truth, motion = simulate(scenario, np.random.default_rng((seed, run)))
     changes = tuple(time for time, _ in scenario.plan.changes) if scenario.inflate else ()
@@ -245,11 +249,11 @@ def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
     )
 
 
-def measure_estimates(run: StudyRun) -> Found:
+def measure_estimates(run: StudyRun) -> RunNumbers:
     """Return mean and rms error and the stated std of each ICR over the second half of a run, and the NIS."""
     half = len(run.t_s) // 2
     error = run.x[half:, 3:] - run.truth[half:, 3:]
-    numbers: Found = {"inverted": is_inverted(run)}
+    numbers: RunNumbers = {"inverted": is_inverted(run)}
     for place, name in enumerate(ICR_NAMES):
         numbers[f"final_{name}_m"] = run.x[-1, 3 + place]
         numbers[f"std_{name}_m"] = run.std[-1, 3 + place]
@@ -258,13 +262,13 @@ def measure_estimates(run: StudyRun) -> Found:
     return numbers | _mean_nis(run)
 
 
-def measure_means(run: StudyRun) -> Found:
+def measure_means(run: StudyRun) -> RunNumbers:
     """Return mean and standard deviation of each estimated ICR over the second half of a run, and the mean truth [m].
 
-    Also the mean distance of the filter's position from the true one.
+    The mean distance of the filter's position from the true position is returned too.
     """
     half = len(run.t_s) // 2
-    means: Found = {"inverted": is_inverted(run)}
+    means: RunNumbers = {"inverted": is_inverted(run)}
     for place, name in enumerate(ICR_NAMES, start=3):
         means[f"mean_{name}_m"] = run.x[half:, place].mean()
         means[f"scatter_{name}_m"] = run.x[half:, place].std()
@@ -273,16 +277,17 @@ def measure_means(run: StudyRun) -> Found:
     return means
 
 
-def _mean_nis(run: StudyRun) -> Found:
+def _mean_nis(run: StudyRun) -> RunNumbers:
+    """Return the mean NIS of fixes and of headings of a run."""
     return {"nis_gnss": float(np.nanmean(run.gnss_nis)), "nis_heading": float(np.nanmean(run.heading_nis))}
 
 
-def measure_times(run: StudyRun, since_s: float = 0.0, until_s: float = np.inf) -> Found:
+def measure_times(run: StudyRun, since_s: float = 0.0, until_s: float = np.inf) -> RunNumbers:
     """Return convergence and settling times [s] of every ICR after `since_s`; NaN where `until_s` comes first."""
     begin = max(int(np.searchsorted(run.t_s, since_s - 1e-9)) - 1, 0)
     end = int(np.searchsorted(run.t_s, until_s - 1e-9))
     t = run.t_s[begin:end] - max(since_s, run.t_s[0])
-    times: Found = {}
+    times: RunNumbers = {}
     for place, name in enumerate(ICR_NAMES):
         value, target = run.x[begin:end, 3 + place], float(run.truth[end - 1, 3 + place])
         times[f"rise_{name}_s"] = convergence_time(t, value, target)
@@ -290,7 +295,7 @@ def measure_times(run: StudyRun, since_s: float = 0.0, until_s: float = np.inf) 
     return {**times, "settle_s": float(np.max([times[f"settle_{name}_s"] for name in ICR_NAMES]))}
 
 
-def measure_changes(run: StudyRun) -> Found:
+def measure_changes(run: StudyRun) -> RunNumbers:
     """Return whether a run ended inverted, and its times after every change of the ICRs, until the next one."""
     plan = run.scenario.plan
     spans = enumerate(pairwise([*(time for time, _ in plan.changes), plan.duration_s]), start=1)
@@ -298,7 +303,7 @@ def measure_changes(run: StudyRun) -> Found:
     return {"inverted": is_inverted(run), **times}
 
 
-def measure_one_change(run: StudyRun) -> Found:
+def measure_one_change(run: StudyRun) -> RunNumbers:
     """Return whether a run ended inverted, and its times after the first change of the ICRs."""
     return {"inverted": is_inverted(run), **measure_times(run, run.scenario.plan.changes[0][0])}
 
@@ -340,8 +345,8 @@ def is_inverted(run: StudyRun) -> float:
     return float(not run.x[-1, 3] > run.x[-1, 4])
 
 
-def measure_fate(run: StudyRun) -> Found:
-    """Return which of `FATES` a run had, as 1 and 0, and the ICRs at its end."""
+def measure_fate(run: StudyRun) -> RunNumbers:
+    """Return 1 for the outcome of a run, 0 for the other `FATES`, and the ICRs at its end."""
     last = max(1, len(run.x) // LAST_SHARE)
     error = np.abs(run.x[-last:, 3:] - run.truth[-last:, 3:]).mean(axis=0)
     near, wrong = float((error < CONVERGED_M).all()), is_inverted(run)
@@ -355,22 +360,22 @@ def trace(begin_s: float = 0.0, end_s: float = np.inf, name: str = "trace") -> M
     The array is (about 400, 5) [s, m, m, m, m/s].
     """
 
-    def kept(run: StudyRun) -> Found:
+    def measure(run: StudyRun) -> RunNumbers:
         first = max(int(np.searchsorted(run.t_s, begin_s, "right")) - 1, 0)
         last = int(np.searchsorted(run.t_s, end_s, "right")) - 1
         rows = np.unique(np.linspace(first, last, TRACE_POINTS).astype(np.int64))
         return {name: np.column_stack([run.t_s[rows], run.x[rows, 3:], run.v_left[rows]])}
 
-    return kept
+    return measure
 
 
-def zoom(run: StudyRun) -> Found:
+def trace_change(run: StudyRun) -> RunNumbers:
     """Return the trace around the first change of the ICRs, as array ``zoom``."""
     change_s = run.scenario.plan.changes[0][0]
     return trace(change_s - 1.0, change_s + ZOOM_S, "zoom")(run)
 
 
-def measure_open_loop(run: StudyRun) -> Found:
+def measure_open_loop(run: StudyRun) -> RunNumbers:
     """Return the 95th percentile of the open-loop error after 10 m [m]: with the final ICRs, and without slip.
 
     Notes
@@ -388,7 +393,7 @@ def measure_open_loop(run: StudyRun) -> Found:
     starts = np.flatnonzero(ends < len(distance))
     if len(starts):
         starts = starts[np.linspace(0, len(starts) - 1, TRIAL_STARTS).astype(np.int64)]
-    numbers: Found = {}
+    numbers: RunNumbers = {}
     for name, icrs in (("blind_icr_10m_p95_m", run.x[-1, 3:]), ("blind_no_slip_10m_p95_m", no_slip)):
         errors = []
         for first, last in zip(starts, ends[starts], strict=True):
@@ -400,10 +405,10 @@ def measure_open_loop(run: StudyRun) -> Found:
     return numbers
 
 
-def measure_consistency(run: StudyRun) -> Found:
+def measure_consistency(run: StudyRun) -> RunNumbers:
     """Return mean NEES and NIS, the final errors in standard deviations, and arrays of the values at all stops.
 
-    The arrays: ``stops_s`` (s,), ``all nees`` (s,); of the stops that count ``settled nees`` (c,) and the errors in
+    The arrays are ``stops_s`` (s,), ``all nees`` (s,); of the stops that count ``settled nees`` (c,) and the errors in
     standard deviations ``ratio`` (c, 6); ``all nis_gnss`` (m,), ``all nis_heading`` (h,).
     """
     stops_s = run.t_s[run.stops]

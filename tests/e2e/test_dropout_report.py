@@ -169,7 +169,7 @@ def test_no_run_at_all_is_said_in_one_line(tmp_path: Path) -> None:
     done = report(tmp_path)
     assert done.returncode == 1
     assert done.stderr == (
-        "Error: icrtool-runs: no run in it; name a run directory or a log, or make a run with icrtool fit\n"
+        "Error: icrtool-runs: holds no run; name a run directory or a log, or make a run with icrtool fit\n"
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -15,7 +15,7 @@ from icrtool.output.text_format import run_title, xml_text
 from icrtool.records.fleet_document import FleetVerdict, fleet_verdict
 
 Outcome = DropoutReport | IcrToolError
-"""The outcome of one argument: a report, or why there is none."""
+"""The outcome of one argument: a report, or the error that prevented it."""
 
 
 class Suite(NamedTuple):
@@ -35,7 +35,7 @@ def suite_of(name: str, outcome: Outcome) -> Suite:
 
 
 def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-report") -> None:
-    """Write JUnit XML: a suite a log, a test case a gate.
+    """Write JUnit XML: one suite for each log, and in it one test case for each limit.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def format_outcomes(outcomes: Iterable[tuple[str, Outcome]]) -> str:
 
 def _summary_blocks(report: DropoutReport) -> list[Block]:
     """Return one report: its title, the verdicts, then the sentences and tables that are printed."""
-    # Not at import: a batch needs the verdicts alone.
+    # The import is here because a batch needs only the verdicts.
     from icrtool.output.tables.dropout import dropout_blocks
 
     *blocks, _ = dropout_blocks(report)
@@ -79,13 +79,14 @@ def _summary_blocks(report: DropoutReport) -> list[Block]:
 
 
 def limit_section(verdicts: Sequence[FleetVerdict]) -> Section:
-    """Return the verdicts under their common result, limits that are not met first; empty without any."""
+    """Return the verdicts under their common result, limits that are not met first; empty without verdicts."""
     missed = sum(not verdict.passed for verdict in verdicts)
     title = f"Acceptance limits not met: {missed}" if missed else "All acceptance limits are met"
     return Section(title, [Items([verdict.line for verdict in sorted(verdicts, key=lambda verdict: verdict.passed)])])
 
 
 def _suite(tested: Suite, command: str) -> ET.Element:
+    """Return the element of a suite; an error is a test case with the name of the `command`."""
     name = xml_text(tested.log)
     counts = {
         "tests": len(tested.verdicts) + bool(tested.error),

@@ -25,6 +25,7 @@ from icrtool.records.plain_data import plain_value
 from icrtool.records.run import ICR_COLUMNS
 
 CONTROLLER_TARGETS: tuple[ControllerTarget, ...] = get_args(ControllerTarget)
+"""Names of the targets."""
 
 EXPORT_SCHEMA = "icrtool/export/1"
 """Schema of an export of target ``json``."""
@@ -70,7 +71,7 @@ amcl:
 
 
 def format_export(calibration: Calibration, target: ControllerTarget) -> str:
-    """Return the text to paste, no line end.
+    """Return the text to paste, without the last line end.
 
     Notes
     -----
@@ -121,7 +122,7 @@ def format_export(calibration: Calibration, target: ControllerTarget) -> str:
 
 
 def _driven(calibration: Calibration) -> tuple[int, str, float]:
-    """Return stamp and date of the first drive, and the distance [m] of all."""
+    """Return stamp and date of the first drive, and the distance [m] of all drives."""
     begin_ns = min(log.begin_ns for log in calibration.logs)
     date = "at an unknown date"
     if begin_ns:
@@ -181,7 +182,7 @@ def _parameters(calibration: Calibration, errors: ControllerErrors, target: Cont
 
 
 def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
-    """Return the comments above: where the numbers come from, and what they cannot express."""
+    """Return the comments at the top: where the numbers come from, and what they cannot express."""
     (right, left, x), (std_right, std_left, std_x) = (
         [numbers_by_name[name] for name in ICR_COLUMNS]
         for numbers_by_name in (calibration.geometry, calibration.geometry_std)
@@ -199,8 +200,8 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     if (factor := factor_to_old(calibration)) is not None:
         old = calibration.controller.multiplier / factor
         sentences.append(
-            f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
-            f"{factor:.4f} times the old"
+            f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new value replaces "
+            f"it, and is {factor:.4f} times the old value"
         )
     sentences += [f"WARNING: {one_line(finding.sentence)}" for finding in export_notes(calibration, FIVE)]
     return [
@@ -209,7 +210,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
 
 
 def yaml_number(value: float) -> str:
-    """Return a YAML float of four digits: always with a point, or ROS takes it for an integer."""
+    """Return a number as YAML, of four digits with a point; without a point ROS would read an integer."""
     if not math.isfinite(value):
         raise ValueError(f"{value} cannot be exported")
     mantissa, e, exponent = f"{value:.4g}".partition("e")
@@ -217,7 +218,7 @@ def yaml_number(value: float) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return a text on one line for a comment; the name of a log may hold any character."""
+    """Return a text on one line for a comment, without the line ends that the name of a log may hold."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
@@ -237,7 +238,10 @@ SYMBOLS = {
 
 
 def format_twist(calibration: Calibration) -> str:
-    """Return the JSON text, no line end; `v_x`, `v_y` and `yaw_rate` are each the sum of value times formula."""
+    """Return a calibration as JSON without the last line end.
+
+    `v_x`, `v_y` and `yaw_rate` are each the sum of the products of value and formula.
+    """
     fitted = calibration.fitted
     free = [TERMS[name] for name in fitted.model.terms]
     signs = np.array([sign_in_rep103(term) for term in free])
@@ -278,7 +282,7 @@ def format_twist(calibration: Calibration) -> str:
 
 
 def sign_in_rep103(term: Term) -> float:
-    """Return the factor of a parameter when y points left, turns count counter-clockwise and w = -w."""
+    """Return the sign that a parameter changes by in REP-103, where y points left and a turn w is counter-clockwise."""
     left, right = np.array([0.3]), np.array([0.1])
     same = term.column(wheel_motion(left, right, 1.0))[0] == term.column(wheel_motion(right, left, 1.0))[0]
     return 1.0 if same == (term.axis == VX) else -1.0

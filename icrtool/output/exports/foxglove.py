@@ -135,6 +135,7 @@ def write_foxglove(run: Run, path: Path) -> None:
 
 @cache
 def _typestore() -> Typestore:
+    """Return the message types of ROS 2 and those of icrtool."""
     from rosbags.typesys import get_types_from_msg
 
     store = write_log.load_typestore(ros1=False)
@@ -144,7 +145,7 @@ def _typestore() -> Typestore:
 
 
 def _transforms(paths: Sequence[ExportPath], rows: Ints, store: Typestore) -> write_log.TopicPlan:
-    """Return /tf: one message a state, with the pose of each path."""
+    """Return topic ``/tf``: one message for each state, with the pose of each path."""
     stamps = paths[0].stamp_ns[rows]
     kind = "geometry_msgs/msg/TransformStamped"
     fixed: dict[str, object] = {"transforms": [write_log.blank_message(store, kind) for _ in paths]}
@@ -188,7 +189,7 @@ def _odometry(run: Run, path: ExportPath, rows: Ints) -> write_log.TopicPlan:
 
 
 def _whole_path(path: ExportPath, store: Typestore) -> write_log.TopicMessages:
-    """Return a message at the first state that holds all of a path, thinned."""
+    """Return a message at the first state that holds the whole path, thinned."""
     name = "nav_msgs/msg/Path"
     message: Any = write_log.blank_message(store, name)
     rows, (z, w) = line_rows(path.x_m, path.y_m), path.quaternion
@@ -244,7 +245,7 @@ def _plan(
 
 
 def _errors(run: Run, rows: Ints) -> write_log.TopicPlan:
-    """Return the open-loop errors from the states that have a trial."""
+    """Return topic ``/open_loop_error``: the errors from the states that have a trial."""
     errors, unknown = errors_from_states(run, ERROR_HORIZON_M), np.full(len(run.table), np.nan)
     rows = rows[np.isfinite(errors["icr"][rows])]
     columns = {f"{name}_m": errors.get(name, unknown)[rows] for name in ("icr", "icr_final", "no_slip")}
@@ -253,7 +254,7 @@ def _errors(run: Run, rows: Ints) -> write_log.TopicPlan:
 
 
 def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore) -> write_log.TopicMessages:
-    """Return a message at the begin of each event, and one of kind none at its end."""
+    """Return a message at the begin of each event, and a message of kind ``none`` at its end."""
     stamps, payload = [], []
     for event in events:
         for kind, stamp in ((event["kind"], event["begin_ns"]), ("none", event["end_ns"])):
@@ -301,5 +302,5 @@ def foxglove_layout(run: Run) -> dict[str, Any]:
 
 
 def is_layout(first: bytes) -> bool:
-    """Return whether a file is a layout of ours, by its first bytes."""
+    """Return whether icrtool wrote a layout, by the first bytes of the file."""
     return b"3D!paths" in first[:100]

@@ -22,7 +22,7 @@ NO_IMU_TOPIC, NO_ODOMETRY_TOPIC = "imu/data", "odom"
 
 
 def format_localization(calibration: Calibration, numbers: Localization) -> str:
-    """Return the YAML of both nodes, no line end."""
+    """Return the YAML of both nodes, without the last line end."""
     lines = [*_header(calibration, numbers), *_filter(numbers)]
     if numbers.yaw_offset_rad is not None and numbers.declination_rad is not None:
         lines += [
@@ -35,7 +35,7 @@ def format_localization(calibration: Calibration, numbers: Localization) -> str:
 
 
 def _header(calibration: Calibration, numbers: Localization) -> list[str]:
-    """Return origin, warnings, and the covariances that belong into messages."""
+    """Return origin, warnings, and the covariances that belong in messages."""
     v_x, v_y, yaw_rate = numbers.twist
     rest = yaml_number(NOT_PLANAR)
     row = ", ".join([*map(yaml_number, (v_x.value, v_y.value)), *[rest] * 3, yaml_number(yaw_rate.value)])
@@ -121,6 +121,7 @@ def _used(key: str, names: set[str]) -> list[str]:
 
 
 def _antenna(numbers: Localization) -> list[str]:
+    """Return comments with the command that publishes the place of the antenna; none where it is not known."""
     if (at := numbers.antenna) is None:
         return []
     place = f"--x {at.forward_m:.3f} --y {at.left_m:.3f} --z 0.0"
@@ -131,6 +132,7 @@ def _antenna(numbers: Localization) -> list[str]:
 
 
 def _left_out(numbers: Localization) -> list[str]:
+    """Return comments with the parameters that are left out, each with the reason."""
     lines = (line for reason in numbers.left_out for line in _comment(f"- {one_line(reason)}", 0, "  "))
     return ["# Left out, because the drive does not show it:", *lines] if numbers.left_out else []
 
@@ -148,7 +150,7 @@ def _estimate(estimate: Estimate, unit: str = "") -> str:
 
 
 def _text(topic: str) -> str:
-    """Return a name of a topic as YAML; a log may hold any character."""
+    """Return the name of a topic as YAML, quoted if it has characters that have a meaning there."""
     plain = all(c.isalnum() or c in "/_~-." for c in topic) and topic.isascii()
     return topic if plain else '"' + "".join(c for c in one_line(topic) if c not in '"\\') + '"'
 
@@ -159,5 +161,6 @@ def _inner(text: str) -> list[str]:
 
 
 def _comment(text: str, indent: int = 0, further: str = "") -> list[str]:
+    """Return a comment in lines; `further` stands before each line after the first."""
     first = f"# {' ' * indent}"
     return textwrap.wrap(f"{first}{text}", TEXT_WIDTH, subsequent_indent=f"{first}{further}")

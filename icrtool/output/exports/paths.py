@@ -26,7 +26,7 @@ from icrtool.estimation.odometry import OdometryName, OdometryPath, drive_wheels
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.track import FrozenIcrs
-from icrtool.output.series import BLUE, ORANGE, places
+from icrtool.output.series import BLUE, ORANGE, rows_entering_cells
 from icrtool.output.text_format import PATH_WORDS, driven_text, duration_text, run_title, xml_text
 from icrtool.records.choices import TrajectoryFormat
 from icrtool.records.plain_data import plain_value
@@ -52,7 +52,7 @@ class ExportPath:
 
     Attributes
     ----------
-    name : which one
+    name : name of the path
     stamp_ns : int64 (n,), of the log's clock
     x_m, y_m : float64 (n,), east and north of the datum
     yaw_rad : float64 (n,), counter-clockwise from east, unwrapped
@@ -151,12 +151,12 @@ def rows_apart(stamp_ns: Ints, interval_s: float) -> Ints:
 
 def line_rows(x_m: Floats, y_m: Floats) -> Ints:
     """Return rows (m,) of points (n,) at which a line enters another cell of a fine grid, at least two."""
-    rows = places(y_m, x_m, LINE_CELL_M)
+    rows = rows_entering_cells(y_m, x_m, LINE_CELL_M)
     return rows if len(rows) > 1 else np.repeat(rows, 2)
 
 
 def outage_rows(run: Run) -> Iterator[tuple[tuple[int, int], slice]]:
-    """Yield begin and end [ns] of each outage, and the states of it."""
+    """Yield begin and end [ns] of each outage, and the states in it."""
     stamps = run.table.stamp_ns
     for begin_ns, end_ns in run.outages_ns.tolist():
         first, last = np.searchsorted(stamps, [begin_ns, end_ns])
@@ -171,7 +171,7 @@ DIGITS = 9
 
 
 def format_trajectory(path: ExportPath, target: TrajectoryFormat) -> str:
-    """Return a path as text, a line a state, with a line end.
+    """Return a path as text: one line for each state, with a line end after the last.
 
     Notes
     -----
@@ -205,7 +205,7 @@ Feature = dict[str, Any]
 
 
 def format_geojson(run: Run) -> str:
-    """Return a feature collection, no line end; the attribute ``layer`` states the kind of each feature.
+    """Return a feature collection without the last line end; the attribute ``layer`` states the kind of each feature.
 
     Layers: ``path`` (a line for each of filter, smoother, ICR and no-slip odometry), ``state`` (points along the
     filter's path, at most one in 0.2 m), ``fix``, ``event`` and ``outage`` (a line).
@@ -235,7 +235,7 @@ def coordinates_of(x_m: Floats, y_m: Floats, globe: Globe) -> list[list[float]]:
 
 
 def _line(layer: str, x_m: Floats, y_m: Floats, globe: Globe, properties: dict[str, Any]) -> Feature:
-    """Return a line, thinned."""
+    """Return a thinned line of a layer through points (n,)."""
     rows = line_rows(x_m, y_m)
     geometry = {"type": "LineString", "coordinates": coordinates_of(x_m[rows], y_m[rows], globe)}
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer} | properties}
@@ -269,8 +269,9 @@ def _outage_features(run: Run, globe: Globe) -> Iterator[Feature]:
 
 
 def _state_features(run: Run, globe: Globe) -> Iterator[Feature]:
+    """Yield a point for each state of the thinned path, with its speeds, ICRs and open-loop errors."""
     table = run.table
-    rows = places(table.north_m, table.east_m, STATE_CELL_M)
+    rows = rows_entering_cells(table.north_m, table.east_m, STATE_CELL_M)
     stamps = table.stamp_ns[rows]
     columns: dict[str, list[Any]] = {"time_utc": utc_text(stamps), "stamp_ns": stamps.tolist()}
     names = ["t_s", "distance_m", "heading_deg", "v_left_mps", "v_right_mps", "std_north_m", "std_east_m"]
@@ -285,6 +286,7 @@ def _state_features(run: Run, globe: Globe) -> Iterator[Feature]:
 
 
 def _fix_features(run: Run, globe: Globe) -> Iterator[Feature]:
+    """Yield a point for each fix, with its class and its use by the filter."""
     fixes, outcome, uses = run.sensors.fixes, run.gnss, {UNSEEN: "not in the run", GATED: "rejected"}
     columns = {
         "time_utc": utc_text(fixes.stamp_ns),
@@ -322,7 +324,7 @@ EXPORT_COLORS: dict[PathName | str, str] = {
 
 
 def format_kml(run: Run) -> str:
-    """Return a KML document, no line end: lines on the ground, a track with times, outages, events.
+    """Return a KML document without the last line end: lines on the ground, a track with times, outages, events.
 
     Raises
     ------

@@ -37,7 +37,7 @@ FORECAST_KEY_COLUMNS = 4
 """Number of columns in the legend of a forecast."""
 
 BEYOND_LOOK: style.Look = {"color": style.OUTAGE_COLOR, "linewidth": 0, "zorder": 0.5}
-"""Area of distances at which no error was measured."""
+"""Look of the area of distances at which no error was measured."""
 
 
 @styled
@@ -47,7 +47,8 @@ def forecast_figure(
 ) -> Figure | Axes:  # fmt: skip
     """Return the figure of a forecast: errors over distance with the budgets, and the path with circles of errors.
 
-    `document`: of the run whose path it is; a run without datum has axes x and y. None: of a path with east and north.
+    `document` is the document of the run whose path it is: a run without datum has axes x and y. With None the axes are
+    east and north.
     """
     reached = within_budget(forecast.distance_m, forecast.p95_m, budgets_m[0]) if budgets_m else None
     total_m = float(forecast.distance_m[-1])
@@ -93,7 +94,7 @@ def _draw_error_circles(axes: Axes, forecast: Forecast, last_m: float) -> None:
     rows = rows[np.isclose(np.round(forecast.distance_m[rows] / step_m) * step_m, forecast.distance_m[rows])]
     blue = style.ICR["color"]
     at = [(float(forecast.east_m[row]), float(forecast.north_m[row])) for row in rows]
-    # the largest circle lies lowest
+    # The largest circle is drawn first, below the others.
     for place, row in sorted(zip(at, rows, strict=True), key=lambda circle: -forecast.p95_m[circle[1]]):
         radius = float(forecast.p95_m[row])
         axes.add_patch(Circle(place, radius, facecolor=blue, alpha=0.13, linewidth=0, zorder=1.5))
@@ -131,9 +132,10 @@ AFTER_LOOK: style.Look = {"color": style.ICR["color"], "linestyle": "-", "linewi
 
 @styled
 def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return how many windows have a residual below each size, of places [m] and headings [deg], before and after.
+    """Return the figure of residuals of places [m] and headings [deg]: the share of windows below each size.
 
-    The third panel has the median residual of the heading change by the heading change: a slope is a wrong multiplier.
+    Each is drawn before and after the calibration. The third panel has the median residual of the heading change by the
+    heading change: a slope is a wrong multiplier.
     """
     off_m = [np.hypot(*part) for part in (residuals.before, residuals.after)]
     turns = [np.degrees(part) for part in (residuals.turn_before, residuals.turn_after)]
@@ -190,7 +192,7 @@ ALONE_LOOK: style.Look = style.spot_look("white", 6.0, "X", "0.35")
 
 
 class Difference(NamedTuple):
-    """A row of a forest plot: words, a number [m], and its 95 % interval [m], None where there is none."""
+    """A row of a forest plot: words, a number [m], and its 95 % interval [m], which may be None."""
 
     words: str
     value_m: float
@@ -200,7 +202,7 @@ class Difference(NamedTuple):
 
 @styled
 def transfer(comparison: GroupComparison, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the 95 % errors of each group by calibration, and the differences between groups, with 95 % intervals.
+    """Return the figure of the 95 % errors of each group by calibration, and of the differences between groups.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
@@ -227,7 +229,7 @@ def transfer(comparison: GroupComparison, *, ax: Axes | None = None) -> Figure |
 
 
 def _group(name: str) -> str:
-    return style.drawable(name, LONGEST_GROUP_NAME)
+    return style.drawable_text(name, LONGEST_GROUP_NAME)
 
 
 def _comparison_title(comparison: GroupComparison) -> str:
@@ -281,7 +283,7 @@ def _differences(comparison: GroupComparison) -> list[Difference]:
 
 
 def _draw_forest(axes: Axes, rows: Sequence[Difference], *, about_zero: bool = False) -> None:
-    """Draw numbers with their intervals, a row each; `about_zero`: an interval that holds zero may be chance."""
+    """Draw numbers with their intervals, in rows; `about_zero`: an interval that holds zero may be chance."""
     for y, row in enumerate(rows):
         if row.low_m is None or row.high_m is None:
             axes.plot([row.value_m], [y], label="no interval: too little path", **ALONE_LOOK)
@@ -338,12 +340,12 @@ class FleetNumbers(NamedTuple):
 
 def _dated(log: str, start_utc: str) -> str:
     """Return the label of a log: its name, and its date where it is known."""
-    return f"{style.drawable(log, LONGEST_LOG)}   {start_utc[:10]}".rstrip()
+    return f"{style.drawable_text(log, LONGEST_LOG)}   {start_utc[:10]}".rstrip()
 
 
 @styled
 def fleet_icrs(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return both lateral ICRs of every log, ±σ, a colour and marker per robot.
+    """Return the figure of both lateral ICRs of every log, ±σ, with a colour and a marker for each robot.
 
     Up to `MOST_CALENDAR_ROWS` logs have a row each with name and date, in the order of the dates; more are drawn over
     their dates. `ax`: axes to draw into, which are returned; by default the picture is a new figure.
@@ -382,7 +384,7 @@ def fleet_icrs(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
 
 def _key_of(robot: str) -> str:
     """Return the name of a robot in a legend; matplotlib leaves out a name that begins with an underscore."""
-    return f" {style.drawable(robot or 'robot not named', LONGEST_ROBOT)}"
+    return f" {style.drawable_text(robot or 'robot not named', LONGEST_ROBOT)}"
 
 
 def _draw_over_dates(sheet: Sheet, points: Sequence[FleetLog]) -> None:
@@ -413,7 +415,7 @@ def _draw_over_dates(sheet: Sheet, points: Sequence[FleetLog]) -> None:
 
 @styled
 def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs the largest errors.
+    """Return the figure of the 95 % error after 10 m [m] of every log by group; of many logs the largest errors.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
@@ -438,7 +440,7 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
     for (group, logs), look in zip(fleet.errors_m.items(), cycle(GROUP_LOOKS), strict=False):
         rows = [row for row, robot in enumerate(robots) if robot[0] == group]
         middle = error_text(float(np.median(list(logs.values()))))
-        label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
+        label = f" {style.drawable_text(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
         axes.plot([robots[row][2] for row in rows], rows, markersize=5.5, label=label, zorder=3, **look)
         for row in rows:
             if (ends := fleet.intervals_m.get(robots[row][1])) is not None:

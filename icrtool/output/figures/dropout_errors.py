@@ -82,11 +82,11 @@ MOSTLY_BEYOND_PCT = 90.0
 
 @styled
 def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return 95 % and expected error [m] over distance without fixes [m]: how far each model stays within the budget.
+    """Return the figure of 95 % and expected error [m] over distance without fixes [m], with the budget.
 
-    It shows the rows that are shown and pictured; rows for comparison are thin lines. The first row has bands: its
-    interval on this drive, and where its error on the next drive lies. The others have bars at some distances, so that
-    no two bands overlap. `ax`: axes to draw into, which are returned; by default the picture is a new figure.
+    It has the rows that are shown and pictured; rows for comparison are thin lines. The first row has bands: its
+    interval on this drive, and the range of its error on the next drive. The other rows have bars at some distances,
+    so that no two bands overlap. `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
     models = [*_models(report), *(result for result in _pictured(report) if row_of(result.name).compared)]
     first, horizons_m = models[0], report.horizons_m
@@ -95,7 +95,7 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     pens, rows = _pens(report), [row for row in first.document.by_horizon if row.p95_m is not None]
     ends = [rows[row] for row in ((0, -1) if len(rows) > 1 else (0,) if rows else ())]
     trials = ", ".join(f"{row.trials:,} trials of {row.horizon_m:g} m" for row in ends)
-    # Both errors and bands of the first model, the other models and their bars, budget, outages.
+    # The legend has both errors and bands of the first model, the other models and their bars, budget and outages.
     keys_in = style.KEY_ROW_IN * max(-(-(len(models) + 6) // SUMMARY_KEY_COLUMNS) - 2, 0)
     sheet = new_sheet(
         _summary_title(report, first), f"{run_title(report.run_document)}: {first.name}, {trials or 'no trials'}", ax,
@@ -155,7 +155,7 @@ def _summary_title(report: DropoutReport, first: ModelResult) -> str:
     """Return how far the first row stays within its budget, on this drive and on the next; else its last error."""
     best = next((reach for reach in report.document.budgets if reach.model == first.name), None)
     if best is not None:
-        # One question, two answers: where the next drive has the same, one is enough.
+        # The distance on the next drive is left out where it is the same.
         after = f"; next drive {best.next_text}" if best.next_text and best.next_text != best.short_text else ""
         answer = f"within {best.budget_m:g} m (95 %) for {best.short_text}{after}"
         headline = f"{first.name}: {answer}"
@@ -194,7 +194,7 @@ def _write_end(axes: Axes, report: DropoutReport, first: ModelResult) -> None:
 
 @styled
 def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | None = None) -> Figure | Axes:
-    """Return the percent of the trials by error [m] of the first row, a panel a horizon, and the budget.
+    """Return histograms of the errors [m] of the first row in percent of the trials: one panel for each horizon.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
@@ -228,7 +228,7 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | Non
 
 @styled
 def dropout_histogram(report: DropoutReport, horizon_m: float, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the percent of the trials by error [m] at one of the report's horizons [m], a panel a model.
+    """Return histograms of the errors [m] at one of the report's horizons [m]: one panel for each model.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
@@ -272,10 +272,12 @@ def _models(report: DropoutReport) -> list[ModelResult]:
 
 
 def _pens(report: DropoutReport) -> dict[str, style.Look]:
+    """Return the looks of the rows of a report by name."""
     return style.row_pens(result.name for result in report.results)
 
 
 def _place(report: DropoutReport, horizon_m: float) -> int:
+    """Return the index of a horizon [m] of a report."""
     if horizon_m not in report.horizons_m:
         raise ValueError(f"horizon_m: {horizon_m:g} m is not among the report's horizons")
     return int(np.flatnonzero(report.horizons_m == horizon_m)[0])

@@ -18,10 +18,10 @@ from icrtool.output.figures.trajectory import (
     JUMP_LOOK,
     draw_path,
     fitted_box_in,
-    look_down,
     name_directions,
+    show_from_above,
 )
-from icrtool.output.series import places, round_steps
+from icrtool.output.series import round_steps, rows_entering_cells
 from icrtool.output.text_format import (
     direction_words,
     duration_text,
@@ -81,16 +81,16 @@ SLOWEST_SHOWN_MPS = 0.001
 
 @styled
 def dropout_examples(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return a trial of about half a turn and the straightest one side by side [m]: reference, ICR, no slip.
+    """Return the figure of a trial of about half a turn and of the straightest trial [m], side by side.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
     Raises
     ------
     DataError
-        The report holds none; `icrtool.dropout_report` makes one that does.
+        The report holds none of them; make it with `icrtool.dropout_report`.
     """
-    examples = _needed(report, report.examples, "example trials")
+    examples = _require(report, report.examples, "example trials")
     trials = [example.document for example in examples]
     errors = " and ".join(error_text(trial.errors_m[trial.model]) for trial in trials)
     kinds_text = "about half a turn (left), as straight as the drive has it (right)"
@@ -116,16 +116,16 @@ def dropout_examples(report: DropoutReport, *, ax: Axes | None = None) -> Figure
 
 @styled
 def dropout_worst(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the worst trials [m], each in a cell with its own scale; the first cell shows where they start.
+    """Return the figure of the worst trials [m], each in a cell with its own scale; the first cell has their starts.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
     Raises
     ------
     DataError
-        The report holds none; `icrtool.dropout_report` makes one that does.
+        The report holds none of them; make it with `icrtool.dropout_report`.
     """
-    worst = _needed(report, report.worst, "worst trials")[: WORST_COLUMNS * WORST_ROWS - 1]
+    worst = _require(report, report.worst, "worst trials")[: WORST_COLUMNS * WORST_ROWS - 1]
     first = worst[0].document
     rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), first.model
     subtitle = f"{model}, the {len(worst)} worst trials, none overlapping"
@@ -151,7 +151,7 @@ def dropout_worst(report: DropoutReport, *, ax: Axes | None = None) -> Figure | 
 
 def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, east_m: Floats) -> None:
     """Draw the whole path and the numbered starts of the trials."""
-    cell = look_down(axes, north_m, east_m, margin=0.12, ticks=0)
+    cell = show_from_above(axes, north_m, east_m, margin=0.12, ticks=0)
     draw_path(axes, north_m, east_m, cell, PATH, zorder=2)
     starts = [(trial.east_m, trial.north_m) for trial in worst]
     axes.plot(*zip(*starts, strict=True), zorder=3, **style.spot_look("white", 4.0))
@@ -184,22 +184,22 @@ def _draw_scale(axes: Axes) -> None:
 
 @styled
 def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the path [m] with its forced and real outages, and their end errors [m].
+    """Return the figure of the path [m] with its forced and real outages, and their end errors [m].
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
     Raises
     ------
     DataError
-        The report holds none; `icrtool.dropout_report` makes one that does.
+        The report holds none of them; make it with `icrtool.dropout_report`.
     """
-    outages = _needed(report, report.outages, "outages")
+    outages = _require(report, report.outages, "outages")
     norths, easts, whole = _view_of_outages(report, outages)
     width_in = style.WIDTH_IN - 0.95
     box_in = fitted_box_in(norths, easts, width_in)
     parts = []
     for kind in OUTAGES:
-        # Number and largest end error of each kind.
+        # The labels of the legend have number and largest end error of each kind.
         if ours := [outage.document for outage in outages if outage.document.kind == kind]:
             worst = max(outage.end_error_m or 0.0 for outage in ours)
             lengths = sorted({round(outage.end_s - outage.begin_s, 1) for outage in ours})
@@ -211,7 +211,7 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     subtitle = f"{run_title(report.run_document)}: {'; '.join(parts)}{part}"
     sheet = new_sheet(title, subtitle, ax, height_in=box_in + 1.65)
     axes = sheet.subplots()[0, 0]
-    cell = look_down(axes, norths, easts, ticks=9)
+    cell = show_from_above(axes, norths, easts, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
     for outage in outages:
         kind = outage.document.kind
@@ -219,7 +219,7 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
         ends = [(outage.east_m[row], outage.north_m[row]) for outage in outages]
         axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **style.spot_look(fill))
-    # Number and end error near the end of each outage where there is space; the tables hold all of them.
+    # Number and end error are written near the end of each outage if there is space; the tables hold all of them.
     labels = [
         Label(
             f"{number}: {error_text(outage.document.end_error_m)}", float(outage.east_m[-1]), float(outage.north_m[-1])
@@ -243,7 +243,7 @@ MOST_VIEW = 0.7
 
 
 def _view_of_outages(report: DropoutReport, outages: Sequence[Outage]) -> tuple[Floats, Floats, bool]:
-    """Return north and east (n,) [m] of what the view of outages holds, and whether that is the whole path."""
+    """Return north and east (n,) [m] of the points in the view of outages, and whether they are the whole path."""
     paths = report.reference_north_m, report.reference_east_m
     lost = [np.concatenate([getattr(outage, name) for outage in outages]) for name in ("north_m", "east_m")]
     span_m = max(float(np.ptp(path)) for path in paths)
@@ -282,20 +282,20 @@ MARKED_WORST = 3
 
 @styled
 def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the path [m], each place coloured by the error [m] of the trial that starts there.
+    """Return the figure of the path [m], each place coloured by the error [m] of the trial that starts there.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
 
     Raises
     ------
     DataError
-        The report holds none; `icrtool.dropout_report` makes one that does.
+        The report holds none of them; make it with `icrtool.dropout_report`.
     """
     from matplotlib import colormaps
     from matplotlib.collections import LineCollection
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
-    (errors,) = _needed(report, () if report.path_errors is None else (report.path_errors,), "errors along the path")
+    (errors,) = _require(report, () if report.path_errors is None else (report.path_errors,), "errors along the path")
     north, east, after = report.reference_north_m, report.reference_east_m, f"{errors.horizon_m:g} m"
     p95, most = float(np.quantile(errors.error_m, 0.95)), float(errors.error_m.max())
     title = f"95 % of the trials end within {error_text(p95)} after {after}, the worst {error_text(most)}"
@@ -305,9 +305,9 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
         title, subtitle, ax, height_in=box_in + sum(MAP_MARGINS_IN[2:]), margins_in=MAP_MARGINS_IN
     )  # fmt: skip
     axes = sheet.subplots()[0, 0]
-    cell = look_down(axes, north, east, margin=0.06, ticks=9)
+    cell = show_from_above(axes, north, east, margin=0.06, ticks=9)
     draw_path(axes, north, east, cell, UNSCORED, zorder=2, label="no trial starts here")
-    rows = places(north, east, CELLS_A_STEP * cell)
+    rows = rows_entering_cells(north, east, CELLS_A_STEP * cell)
     # Each part of the path has its largest error; a part without a start has that of the last start before it, up to
     # twice the usual distance between starts.
     nearest = np.maximum(np.searchsorted(errors.start, rows[:-1], side="right") - 1, 0)
@@ -356,10 +356,11 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
 Content = TypeVar("Content", ExampleTrial, Outage, PathErrors)
 
 
-def _needed(report: DropoutReport, content: tuple[Content, ...], content_word: str) -> tuple[Content, ...]:
+def _require(report: DropoutReport, content: tuple[Content, ...], content_word: str) -> tuple[Content, ...]:
+    """Return the content of a report; raise an error for a report that holds none."""
     if not content:
         raise DataError(
-            report.name, f"the report holds no {content_word}", "icrtool.dropout_report finds what there is"
+            report.name, f"the report holds no {content_word}", "make the report with icrtool.dropout_report"
         )
     return content
 
@@ -372,7 +373,7 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, ticks: i
     lines += [(path.north, path.east, pens[name], name) for name, path in drawn.items()]
     lines = [(north - trial.north_m, east - trial.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
-    cell = look_down(axes, norths, easts, ticks=ticks)
+    cell = show_from_above(axes, norths, easts, ticks=ticks)
     axes.plot([0.0], [0.0], zorder=6, label="start", **style.spot_look("white"))
     for order, (north, east, pen, label) in enumerate(lines):
         draw_path(axes, north, east, cell, pen, zorder=2 + min(order, 1), label=label)

@@ -58,7 +58,7 @@ LEARNING_MARGIN = 0.6
 """Time after the convergence that the panel of the learning shows, as a share of the learning time."""
 
 LEAST_MARGIN_S = 10.0
-"""Smallest such time [s]."""
+"""Smallest time after the convergence that this panel shows [s]."""
 
 ICR_BINS = 30
 """Approximate number of bins of a histogram of an ICR."""
@@ -72,10 +72,10 @@ def _time_axis(span_s: float) -> tuple[str, float]:
 
 @styled
 def icr_estimates(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the three ICR estimates over time with ±1σ, start and convergence, b/2 where known, and outages.
+    """Return the figure of the three ICR estimates over time, with ±1σ, convergence, half track width and outages.
 
     A long run has two columns, each with its own scale: the learning, and what follows. Behind the end stand the ICRs
-    of the whole drive, which the text states first. `ax`: axes to draw into, which are returned; by default the picture
+    of the whole drive, which the title states. `ax`: axes to draw into, which are returned; by default the picture
     is a new figure.
     """
     finals, stds = run.document.icr.final, run.document.icr.final_std
@@ -118,7 +118,7 @@ def icr_estimates(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
 
 @styled
 def icr_clusters(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return histograms of the three ICR estimates [m] after convergence, in percent of the time.
+    """Return the figure with histograms of the three ICR estimates [m] after convergence, in percent of the time.
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
@@ -210,7 +210,7 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
     """Draw percent of time over value, and show `span_m` of it."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
-    # A round width that gives about `ICR_BINS` bins.
+    # The width of the bins is round, and gives about `ICR_BINS` bins.
     target = span_m / ICR_BINS
     width = float(min(round_steps(target), key=lambda step: abs(step - target)))
     first, last = int(np.floor(low / width)), int(np.ceil(high / width))
@@ -246,7 +246,7 @@ MOST_CROSSES = 400
 
 @styled
 def gnss_difference(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the distance between filter and fixes [m] over time, with separate marks for rejected fixes.
+    """Return the figure of the distance between filter and fixes [m] over time, with marks for rejected fixes.
 
     If there are many fixes, the range and the median in each of `TIME_BINS` equal times are drawn. `ax`: axes to draw
     into, which are returned; by default the picture is a new figure.

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.output.figures import style
-from icrtool.output.series import places
+from icrtool.output.series import rows_entering_cells
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,7 +103,7 @@ def write_labels(
 def _along(path: Floats, step: float) -> Floats:
     """Return points of a line (n, 2) at most about `step` apart."""
     path = path[np.isfinite(path).all(axis=1)]
-    kept = path[places(path[:, 1], path[:, 0], step)]
+    kept = path[rows_entering_cells(path[:, 1], path[:, 0], step)]
     if len(kept) < 2:
         return kept
     lengths = np.hypot(*np.diff(kept, axis=0).T)

@@ -1,4 +1,4 @@
-"""Where a picture is drawn: in a figure of its own, or in axes of the caller."""
+"""The place of a picture: a figure of its own, or axes of the caller."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ class Drawing(Protocol[Subject_contra]):
 def styled(draw: Callable[Concatenate[Subject_contra, ...], Figure | Axes]) -> Drawing[Subject_contra]:
     """Return a function that draws a new figure in our style, and axes of the caller in the caller's style.
 
-    It has the keyword ``ax`` of `draw`. The settings of matplotlib are the same before and after a call.
+    The returned function has the keyword ``ax`` of `draw`. The settings of matplotlib are the same before and after a
+    call.
     """
 
     @wraps(draw)
@@ -73,20 +74,20 @@ def styled(draw: Callable[Concatenate[Subject_contra, ...], Figure | Axes]) -> D
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Where a picture is drawn.
+    """The place of a picture: a figure of its own, or axes of the caller.
 
     Attributes
     ----------
     figure : holds the axes
     ax : axes of the caller; None: `figure` has been made for this picture
     panels : the axes that were drawn into
-    of_caller : what `ax` held before
+    callers_artists : artists that `ax` held before
     """
 
     figure: Figure
     ax: Axes | None = None
     panels: list[Axes] = field(default_factory=list)
-    of_caller: tuple[Artist, ...] = ()
+    callers_artists: tuple[Artist, ...] = ()
 
     def subplots(
         self, rows: int = 1, columns: int = 1, *, sharex: Share = False, sharey: Share = False,
@@ -154,15 +155,16 @@ class Sheet:
         return self.figure
 
     def _fit_to_dark(self, ax: Axes) -> None:
-        """Give what was drawn on dark axes of the caller their colours in place of black, greys and white.
+        """Replace black, greys and white in a picture on dark axes of the caller by the colours of these axes.
 
-        Black becomes the colour of the axes' names, white their background, and a grey lies between both.
+        Black becomes the colour of the axes' names, white becomes their background, and greys lie between both.
         """
         fore, back = (np.array(to_rgb(color)) for color in (ax.xaxis.label.get_color(), _background(ax)))
         if not (back.mean() < MID_GREY < fore.mean()):
             return
 
-        def fitted(color: ColorType | Sequence[ColorType]) -> Floats | tuple[float, ...]:
+        def adapted(color: ColorType | Sequence[ColorType]) -> Floats | tuple[float, ...]:
+            """Return a colour, or colours, with black, greys and white replaced."""
             rgba = np.atleast_2d(to_rgba_array(color)).copy()
             grey = (np.ptp(rgba[:, :3], axis=1) == 0.0) & (rgba[:, 3] > 0.0)
             share = rgba[grey, :1]
@@ -171,21 +173,21 @@ class Sheet:
 
         for panel in self.panels:
             key = panel.get_legend()
-            keys = [] if key is None or key in self.of_caller else key.legend_handles
+            keys = [] if key is None or key in self.callers_artists else key.legend_handles
             for artist in (*panel.lines, *panel.collections, *panel.patches, *keys):
-                if artist is None or artist in self.of_caller:
+                if artist is None or artist in self.callers_artists:
                     continue
                 if isinstance(artist, Collection) and artist.get_array() is not None:
-                    # its colours are of a scale
+                    # The colours of a scale stay.
                     continue
                 of_line = ("color", "markerfacecolor", "markeredgecolor")
                 names = of_line if isinstance(artist, Line2D) else ("facecolor", "edgecolor")
                 properties = {name: getattr(artist, f"get_{name}")() for name in names}
-                artist.set(**{name: fitted(color) for name, color in properties.items() if len(to_rgba_array(color))})
+                artist.set(**{name: adapted(color) for name, color in properties.items() if len(to_rgba_array(color))})
             for text in panel.texts:
-                # light words have the caller's colour already
-                if text not in self.of_caller and np.mean(to_rgb(text.get_color())) < MID_GREY:
-                    text.set(color=fitted(text.get_color()))
+                # Light words have the caller's colour already.
+                if text not in self.callers_artists and np.mean(to_rgb(text.get_color())) < MID_GREY:
+                    text.set(color=adapted(text.get_color()))
 
 
 def _background(ax: Axes) -> ColorType:
@@ -216,5 +218,5 @@ def new_sheet(
     if ax is None:
         layout = {"height_in": height_in, "width_in": width_in, "wspace": wspace, "hspace": hspace}
         return Sheet(style.new_figure(title, subtitle, margins_in=margins_in, **layout))
-    ax.set_title(style.drawable(title), loc="left", parse_math=False, wrap=True)
-    return Sheet(cast("Figure", ax.get_figure(root=True)), ax, of_caller=tuple(ax.get_children()))
+    ax.set_title(style.drawable_text(title), loc="left", parse_math=False, wrap=True)
+    return Sheet(cast("Figure", ax.get_figure(root=True)), ax, callers_artists=tuple(ax.get_children()))

@@ -83,12 +83,12 @@ TRUTH: style.Look = {"linewidth": 0.9, "linestyle": (0, (4, 2))}
 """Line of the truth."""
 
 Draw = Callable[["Axes", StudyResult, list[Level]], None]
-"""Draws the levels of one series."""
+"""Type of a function that draws the levels of one series."""
 
 
 @styled
 def study_figure(result: StudyResult, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return the picture of a study."""
+    """Return the picture of a study; `ax`: axes to draw into, which are returned."""
     rows = STUDY_PICTURES[result.request.name]
     names = dict.fromkeys(level.setting.series for level in result.levels)
     of_series = [[level for level in result.levels if level.setting.series == name] for name in names]
@@ -113,7 +113,7 @@ def _varied(result: StudyResult) -> str:
     return f"{result.study.varies[:1].upper()}{result.study.varies[1:]}"
 
 
-def over(
+def draw_columns(
     axes: Axes, result: StudyResult, levels: Sequence[Level], columns: dict[str, style.Look], *, log: str = ""
 ) -> None:
     """Draw columns over the varied setting: medians, and bars from the 5th to the 95th percentile.
@@ -126,7 +126,7 @@ def over(
     values = [level.setting.value for level in levels]
     for place, (column, look) in enumerate(columns.items()):
         numbers = [level.metrics()[column] for level in levels]
-        _points(
+        _draw_points(
             axes,
             values,
             [(statistics["p5"], statistics["p50"], statistics["p95"]) for statistics in numbers],
@@ -143,7 +143,7 @@ def over(
         axes.set_yscale("log")
 
 
-def _points(axes: Axes, values: Sequence[Any], numbers: Sequence[Any], look: style.Look, shift: float) -> None:
+def _draw_points(axes: Axes, values: Sequence[Any], numbers: Sequence[Any], look: style.Look, shift: float) -> None:
     """Draw (low, middle, high) over numbers, or over names at equal steps."""
     x: Any = values
     if isinstance(values[0], str):
@@ -153,10 +153,10 @@ def _points(axes: Axes, values: Sequence[Any], numbers: Sequence[Any], look: sty
     axes.errorbar(x, middle, [middle - low, high - middle], elinewidth=0.8, capsize=2.0, **WIDE | look)
 
 
-def errors(axes: Axes, result: StudyResult, levels: Sequence[Level], *, log: str = "") -> None:
+def draw_errors(axes: Axes, result: StudyResult, levels: Sequence[Level], *, log: str = "") -> None:
     """Draw the ICR errors over the varied setting; bars of settings with a diverged run are cut at the frame."""
-    columns = _by_icr("error_{icr}_m")
-    over(axes, result, levels, columns, log=log)
+    columns = _looks_by_icr("error_{icr}_m")
+    draw_columns(axes, result, levels, columns, log=log)
     medians = [level.metrics()[column]["p50"] for level in result.levels for column in columns]
     finite = [value for value in (*medians, 0.0) if np.isfinite(value)]
     reach = 0.3 * max(LEAST_RANGE_M, float(np.ptp(finite)))
@@ -164,18 +164,19 @@ def errors(axes: Axes, result: StudyResult, levels: Sequence[Level], *, log: str
     axes.set_ylim(min(finite) - reach, max(finite) + reach)
 
 
-def _by_icr(column: str) -> dict[str, style.Look]:
+def _looks_by_icr(column: str) -> dict[str, style.Look]:
+    """Return the look of each ICR by the name of its column; {icr} stands for the ICR in the pattern `column`."""
     return {column.format(icr=icr): look for icr, look in style.ICR_LOOKS.items()}
 
 
-def inversions(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
+def draw_inversions(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the share of the runs that end inverted, over the varied setting."""
     shares = [100 * level.metrics()["inverted"]["mean"] for level in levels]
     axes.plot([level.setting.value for level in levels], shares, color="black", marker="o", markersize=3.5)
     axes.set(ylim=(-4, 104), xlabel=_varied(result))
 
 
-def along(axes: Axes, t: Floats, values: Floats, look: style.Look) -> None:
+def draw_percentiles(axes: Axes, t: Floats, values: Floats, look: style.Look) -> None:
     """Draw median and 5 to 95 % of values (runs, k) along time t (k,) [s]."""
     low, middle, high = np.nanpercentile(values, [5, 50, 95], axis=0)
     if len(values) > 1:
@@ -186,7 +187,9 @@ def along(axes: Axes, t: Floats, values: Floats, look: style.Look) -> None:
         axes.set_xlim(t[0], t[-1])
 
 
-def estimates(axes: Axes, _result: StudyResult, levels: Sequence[Level], value: str = "", name: str = "trace") -> None:
+def draw_estimates(
+    axes: Axes, _result: StudyResult, levels: Sequence[Level], value: str = "", name: str = "trace"
+) -> None:
     """Draw the ICR estimates of one level along time, and the truth."""
     value = value or str(shown_path([level.setting.value for level in levels])[0])
     level = next(level for level in levels if level.setting.value == value)
@@ -195,27 +198,27 @@ def estimates(axes: Axes, _result: StudyResult, levels: Sequence[Level], value: 
     truth = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)])
     edges = [t[0], *(time for time, _ in plan.changes), max(t[-1], plan.duration_s)]
     for place, look in enumerate(style.ICR_LOOKS.values()):
-        along(axes, t, traces[..., 1 + place], look | {"linestyle": "-"})
+        draw_percentiles(axes, t, traces[..., 1 + place], look | {"linestyle": "-"})
         axes.step(edges, [*truth[:, place], truth[-1, place]], where="post", color=look["color"], **TRUTH)
     reach = 0.8 * max(LEAST_VIEW_M, float(np.ptp(truth)))
     axes.set_ylim(truth.min() - reach, truth.max() + reach)
 
 
-def starts(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
+def draw_starts(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw y_icr_right of one run along time, from each start whose y_icr_left is nearest to the truth."""
     right, left, _ = result.request.plan.icrs_m
     near = min(sorted(result.request.values), key=lambda value: abs(value - left))
     for level in levels:
         if level.names["start_y_icr_left_m"] == near:
             trace = level.found["trace"][:1]
-            along(axes, trace[0, :, 0], trace[..., 1], {"color": "0.35"})
+            draw_percentiles(axes, trace[0, :, 0], trace[..., 1], {"color": "0.35"})
     axes.axhline(right, color=STUDY_LOOKS[0]["color"], **TRUTH)
     reach = BEYOND * max(LEAST_VIEW_M, *map(abs, result.request.values))
     axes.set_ylim(-reach, reach)
     axes.set_title(f"start y left {near:g} m", loc="left")
 
 
-def fates(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
+def draw_fates(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the outcome of every start over both initial y ICRs; the dashed line is where they are equal."""
     values = sorted(set(result.request.values))
     picture = np.zeros((len(values), len(values), 3))
@@ -233,14 +236,14 @@ def fates(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
         axes.fill_between([], [], color=color, label=fate)
 
 
-def speeds(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
+def draw_speeds(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the left track speed of one run along time, as the filter gets it."""
     for level, look in zip(levels, STUDY_LOOKS, strict=False):
         trace = level.found["trace"][:1]
-        along(axes, trace[0, :, 0], trace[..., 4], look | {"label": level.setting.value, "marker": ""})
+        draw_percentiles(axes, trace[0, :, 0], trace[..., 4], look | {"label": level.setting.value, "marker": ""})
 
 
-def shares(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
+def draw_shares(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the share of the runs that have settled, over time."""
     for number, level in enumerate(levels):
         times = np.sort(level.found["settle_s"])
@@ -252,47 +255,49 @@ def shares(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     axes.set(xscale="log", ylim=(0, 103), xlabel="All three ICRs within 10 % of the truth after [s]")
 
 
-def nees(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
+def draw_nees(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the mean NEES along time, and its 95 % band."""
     runs = len(levels[0].found["nees"])
     axes.axhspan(*chi2_band(6 * runs, runs), color="#d9ead3", zorder=0.5, label="95 % band")
     for level, look in zip(levels, STUDY_LOOKS, strict=False):
         mean = level.found["all nees"].mean(axis=0, keepdims=True)
-        along(axes, level.found["stops_s"][0], mean, look | {"label": level.setting.series})
+        draw_percentiles(axes, level.found["stops_s"][0], mean, look | {"label": level.setting.series})
     axes.set_yscale("log")
 
 
-def coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
+def draw_coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the share of the time in which the truth is within 2 sigma, by state."""
     for place, (level, look) in enumerate(zip(levels, STUDY_LOOKS, strict=False)):
         held = consistency_of(level.found)["coverage_pct"]
-        _points(axes, STUDY_STATES, [(share, share, share) for share in held], look, 0.15 * (place - 1))
+        _draw_points(axes, STUDY_STATES, [(share, share, share) for share in held], look, 0.15 * (place - 1))
     axes.axhline(95.4, color="black", **TRUTH)
 
 
-SETTLING_LINES: Draw = partial(over, columns=_by_icr("settle_{icr}_s"))
-MEANS, SCATTER = (partial(over, columns=_by_icr(f"{statistic}_{{icr}}_m")) for statistic in ("mean", "scatter"))
-RMS: Draw = partial(over, columns=_by_icr("rms_{icr}_m"), log="xy")
-WITHOUT_GNSS: Draw = partial(
-    over, columns={"blind_icr_10m_p95_m": OPEN_LOOP, "blind_no_slip_10m_p95_m": OPEN_LOOP_NO_SLIP}, log="xy"
+SETTLING_LINES: Draw = partial(draw_columns, columns=_looks_by_icr("settle_{icr}_s"))
+MEANS, SCATTER = (
+    partial(draw_columns, columns=_looks_by_icr(f"{statistic}_{{icr}}_m")) for statistic in ("mean", "scatter")
 )
-NOT_INFLATED, INFLATED = (partial(estimates, value=value) for value in ("not inflated", "inflated"))
+RMS: Draw = partial(draw_columns, columns=_looks_by_icr("rms_{icr}_m"), log="xy")
+WITHOUT_GNSS: Draw = partial(
+    draw_columns, columns={"blind_icr_10m_p95_m": OPEN_LOOP, "blind_no_slip_10m_p95_m": OPEN_LOOP_NO_SLIP}, log="xy"
+)
+NOT_INFLATED, INFLATED = (partial(draw_estimates, value=value) for value in ("not inflated", "inflated"))
 
 STUDY_PICTURES: dict[str, tuple[tuple[str, Draw], ...]] = {
-    "convergence": (("ICR estimate [m]", estimates), ("Runs [%]", shares)),
-    "initial": (("Initial y right [m]", fates), ("y right [m]", starts)),
+    "convergence": (("ICR estimate [m]", draw_estimates), ("Runs [%]", draw_shares)),
+    "initial": (("Initial y right [m]", draw_fates), ("y right [m]", draw_starts)),
     "icr-change": (
         ("ICRs, not inflated [m]", NOT_INFLATED), ("ICRs, inflated [m]", INFLATED),
         ("… first change [m]", partial(INFLATED, name="zoom")),
     ),
-    "turn-radius": (("Within 10 % after [s]", SETTLING_LINES), ("Ends inverted [%]", inversions)),
-    "input-noise": (("ICR error [m]", errors),),
-    "input-bias": (("ICR error [m]", errors),),
-    "input-source": (("Left track speed [m/s]", speeds), ("ICR error [m]", errors)),
+    "turn-radius": (("Within 10 % after [s]", SETTLING_LINES), ("Ends inverted [%]", draw_inversions)),
+    "input-noise": (("ICR error [m]", draw_errors),),
+    "input-bias": (("ICR error [m]", draw_errors),),
+    "input-source": (("Left track speed [m/s]", draw_speeds), ("ICR error [m]", draw_errors)),
     "gnss": (("ICR error, rms [m]", RMS), ("10 m without GNSS, p95 [m]", WITHOUT_GNSS)),
-    "rate": (("ICR error [m]", partial(errors, log="x")),),
+    "rate": (("ICR error [m]", partial(draw_errors, log="x")),),
     "speed": (("ICR, mean [m]", MEANS), ("ICR, std [m]", SCATTER)),
-    "consistency": (("NEES, mean (6 expected)", nees), ("Within 2 sigma [%]", coverage)),
+    "consistency": (("NEES, mean (6 expected)", draw_nees), ("Within 2 sigma [%]", draw_coverage)),
 }  # fmt: skip
 """Rows of panels of each picture: name of the y axis, and the function that draws."""
 

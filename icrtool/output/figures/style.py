@@ -104,16 +104,26 @@ def line_look(color: str, dash: str | tuple[float, tuple[float, ...]] = "-", wid
 FIX_COLOR = "0.70"
 FLOAT_COLOR = PURPLE
 BAD_FIX_COLOR = RED
+"""Colours of fixed, float and rejected fixes."""
+
 OUTAGE_COLOR = "0.90"
+"""Colour of times without fixes."""
+
 BAR_COLOR = "#5b8db8"
 BAND_COLOR = "#a6c4e0"
+"""Colours of the bars of a histogram and of bands of one standard deviation."""
+
 FILTER = line_look("black", width=1.1)
 ICR = line_look(BLUE, (0, (6, 2)), 1.5)
 NO_SLIP_LINE = line_look(ORANGE, (0, (6, 1.5, 1.2, 1.5)), 1.5)
+"""Lines of the filter, of ICRs and of a robot without slip."""
+
 HALF_WIDTH = line_look("0.35", (0, (1.5, 2.0)), 1.1)
 """Line at half the track width: an ICR without slip."""
 
 CHANGE_LINE = line_look(RED, (0, (3, 1.5)), 1.1)
+"""Line at a change of the ground."""
+
 MEAN = line_look("black", (0, (5, 2)), 1.1)
 """Line of a mean."""
 
@@ -144,7 +154,7 @@ ICR_LOOKS: dict[str, Look] = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw with the settings of this module and matplotlib's defaults; a matplotlibrc has no effect."""
+    """Set matplotlib to its defaults and `RC` in a block; a matplotlibrc has no effect there."""
     settings = cast(dict[str, Any], mpl.rcParams)
     defaults = cast(dict[str, Any], mpl.rcParamsDefault)
     with mpl.rc_context():
@@ -175,9 +185,9 @@ def new_figure(
     edge = 0.09 / width_in
     most = int(TITLE_CHARACTERS_PER_INCH * width_in)
     at: Look = {"va": "top", "ha": "left", "parse_math": False}
-    figure.text(edge, 1 - 0.09 / height_in, drawable(title, most), fontsize=TITLE_PT, fontweight="bold", **at)
+    figure.text(edge, 1 - 0.09 / height_in, drawable_text(title, most), fontsize=TITLE_PT, fontweight="bold", **at)
     most = int(SUBTITLE_CHARACTERS_PER_INCH * width_in)
-    figure.text(edge, 1 - 0.32 / height_in, drawable(subtitle, most), fontsize=SUBTITLE_PT, color="0.3", **at)
+    figure.text(edge, 1 - 0.32 / height_in, drawable_text(subtitle, most), fontsize=SUBTITLE_PT, color="0.3", **at)
     return figure
 
 
@@ -193,7 +203,7 @@ def write_near(
     axes.annotate(text, place, xytext=offset_pt, textcoords="offset points", **look)
 
 
-def drawable(text: str, longest: int = LONGEST_MESSAGE) -> str:
+def drawable_text(text: str, longest: int = LONGEST_MESSAGE) -> str:
     """Return a text from a log, a path or a configuration with a box for every character that the font lacks.
 
     It is shortened to `longest` characters. Control characters and undecodable bytes become their Python escapes. Draw
@@ -235,7 +245,7 @@ def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
 
 
 def row_pens(names: Iterable[str]) -> dict[str, Look]:
-    """Return how the rows of a report are drawn, by name, in their order."""
+    """Return the looks of the rows of a report by name, in their order."""
     rows = rows_of(names).items()
     return {name: line_look(COLORS[row.color], DASHES[row.dash], ROW_WIDTH * row.width) for name, row in rows}
 

@@ -14,7 +14,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.figures.labels import Label, write_labels
 from icrtool.output.figures.sheet import new_sheet, styled
-from icrtool.output.series import places
+from icrtool.output.series import rows_entering_cells
 from icrtool.output.text_format import PATH_WORDS, direction_words, driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run
 from icrtool.records.run_document import RunDocument
@@ -89,7 +89,7 @@ MOST_STATES = 500_000
 
 @styled
 def trajectory(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
-    """Return fixes, filter, and odometry with final ICRs, momentary ICRs and without slip, over east and north [m].
+    """Return the figure of fixes, filter, and odometry with final ICRs, momentary ICRs and without slip [m].
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
@@ -111,7 +111,7 @@ def trajectory(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     height_in = box_in + PATH_MARGINS_IN[2] + PATH_MARGINS_IN[3]
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=PATH_MARGINS_IN)
     axes = sheet.subplots()[0, 0]
-    cell = look_down(axes, norths, easts, margin=0.04, ticks=9)
+    cell = show_from_above(axes, norths, easts, margin=0.04, ticks=9)
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, style.FILTER, label="filter", zorder=4)
@@ -124,11 +124,11 @@ def trajectory(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
         leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
         label = f"{PATH_WORDS[name]}, ends {distance_text(path.end_error_m)} off{leaves}"
         draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
-        # copies, because views would keep the whole path in memory
+        # Copies are kept, because views would keep the whole path in memory.
         ends_m = path.east_m[-1:].copy(), path.north_m[-1:].copy()
         axes.plot(*ends_m, marker="D", color=pen["color"], markersize=5.0, zorder=4.8)
     _draw_jumps(axes, run)
-    # Slip events: the filter's path through each, and a mark at its begin.
+    # A slip event is drawn as the filter's path through it, with a mark at its begin.
     for event in run.sensors.events:
         rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
         if rows.any():
@@ -163,7 +163,7 @@ def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Fl
     for chosen, look, label in (*groups, rejected):
         if chosen.any():
             north, east = place[chosen & in_view].T
-            drawn_rows = places(
+            drawn_rows = rows_entering_cells(
                 north, east, cell_m if look is not REJECTED_LOOK else cell_m * CELLS_A_VIEW / REJECTED_CELLS
             )
             if look is REJECTED_LOOK:
@@ -224,7 +224,7 @@ def fitted_box_in(norths: Floats, easts: Floats, width_in: float) -> float:
     return float(np.clip(width_in * north / east, *BOX_HEIGHT_IN))
 
 
-def look_down(axes: Axes, norths: Floats, easts: Floats, margin: float = 0.08, ticks: int = 5) -> float:
+def show_from_above(axes: Axes, norths: Floats, easts: Floats, margin: float = 0.08, ticks: int = 5) -> float:
     """Show all points (n,) [m] with a margin and one scale for both directions; return the side of a cell [m].
 
     `ticks` is the approximate number of ticks on each axis; 0: none.
@@ -266,6 +266,6 @@ def name_directions(axes: Axes, document: RunDocument | None = None) -> None:
 
 
 def draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: style.Look, **look: Any) -> None:
-    """Draw a path (n,), a point for each cell it enters."""
-    rows = places(north_m, east_m, cell_m)
+    """Draw a path (n,), with a point for each cell that it enters."""
+    rows = rows_entering_cells(north_m, east_m, cell_m)
     axes.plot(east_m[rows], north_m[rows], **pen, **look)

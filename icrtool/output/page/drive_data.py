@@ -33,7 +33,7 @@ from icrtool.motion.window_fit import own_constants
 from icrtool.output.series import (
     RANGE_PERCENT,
     breaks_after,
-    every_so_many,
+    evenly_spaced_rows,
     extremes,
     percentiles,
     scale_end_m,
@@ -74,7 +74,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
     coordinates : count the axes of the map from the datum; otherwise from the first state
     """
     table = run.table
-    rows, joined = every_so_many(len(table), MOST_PAGE_STEPS)
+    rows, joined = evenly_spaced_rows(len(table), MOST_PAGE_STEPS)
     north, east = float(table.north_m[0]), float(table.east_m[0])
     origin = (float(round(north)), float(round(east))) if coordinates else (north, east)
     half = None if run.track_width_m is None else run.track_width_m / 2
@@ -213,7 +213,7 @@ def _models_data(
         **dict(_held_out(recording, report, steps)),
         **dict(_calibrated(recording, report, steps)),
     }
-    rows, every = every_so_many(len(steps), PATH_POINTS / max(len(paths), 1))
+    rows, every = evenly_spaced_rows(len(steps), PATH_POINTS / max(len(paths), 1))
     packed_paths = {
         name: {
             "every": every,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from icrtool import __version__
 from icrtool.errors import RunError
-from icrtool.output.text_blocks import Block, stated_blocks
+from icrtool.output.text_blocks import Block, filled_blocks
 from icrtool.records.places import Below, read_regular
 from icrtool.records.plain_data import plain_value
 from icrtool.records.text import escaped
@@ -78,7 +78,7 @@ def render(
         # These texts are icrtool's own and not of a log, so they are not escaped.
         policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(script) for script in code[1:]],  # noqa: S704
         data=None if data is None else Markup(written),  # noqa: S704 - escaped for a script element
-        tool_version=__version__, title=title, kind=kind, blocks=list(stated_blocks(blocks)),
+        tool_version=__version__, title=title, kind=kind, blocks=list(filled_blocks(blocks)),
         **{"pictures": {}, **content},
     )  # fmt: skip
 

@@ -45,6 +45,7 @@ def calibration_blocks(result: CalibrationResult | None, sensors: documents.Sens
 
 
 def _result_blocks(result: CalibrationResult) -> list[Block]:
+    """Return the numbers for a controller, the held-out distances and the motion model of a result."""
     calibration, table = result.calibration, result.table
     icrs = [(calibration.geometry[name], calibration.geometry_std[name]) for name in ICR_COLUMNS]
     driven = distance_text(sum(log.distance_m for log in calibration.logs))
@@ -89,7 +90,7 @@ def calibration_file_blocks(calibration: Calibration, title: str) -> list[Block]
         configuration = configuration_blocks(calibration, "CAL.json")
     unknown = "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown)
     table = parameter_table(calibration.fitted, calibration.fitted_with_gyro)
-    # the page states the meaning of a term, the file its name
+    # A page names a parameter by its meaning; the key in the file is the last column.
     named = [
         (f"{WITH_GYRO}{meaning}" if term.startswith(WITH_GYRO) else meaning, *middle, term.removeprefix(WITH_GYRO))
         for term, *middle, meaning in (map(str, row) for row in table.rows)
@@ -197,10 +198,12 @@ def _left_out_table(calibration: Calibration) -> Table:
 
 
 def _date_text(stamp_ns: int) -> str:
+    """Return date and time of a stamp, ``not known`` for stamp 0."""
     return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC" if stamp_ns else "not known"
 
 
 def _errors_text(score: documents.PooledScore | None) -> str:
+    """Return p95 and expected error [m], as ``0.52 / 0.21``; ``–`` without a score."""
     return "–" if score is None else f"{score.p95_m:.2f} / {score.expected_m:.2f}"
 
 
@@ -254,10 +257,10 @@ def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
         shown = any(parameter.verdict == "shown" for parameter in calibration.parameters.values())
         why = "the drive confirms the configuration" if shown else "the drive showed nothing well enough"
         return [estimates, f"nothing to configure: {why}"]
-    # an option and its value stay together
+    # An option and its value stay on one line.
     options = " ".join(f"--set\u00a0{key}={value:g}" for key, value in calibration.settings.items())
     lines = textwrap.wrap(options, OPTIONS_WIDTH, break_long_words=False, break_on_hyphens=False)
-    # a shell joins the lines again
+    # A shell joins the lines again.
     joined = " \\\n  ".join(lines).replace("\u00a0", " ")
     return [estimates, Line(f"to configure:\n  {joined}", "as is")]
 
@@ -346,7 +349,7 @@ def forecast_blocks(
         reached = [f"{'all of it' if metres >= total else f'{metres:.1f} m'}{kind}" for kind, metres in far]
         blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
     if total > (longest := measured_to_m(calibration)):
-        blocks.append(f"errors were measured up to {longest:g} m; what is beyond is extrapolated")
+        blocks.append(f"errors were measured up to {longest:g} m; errors beyond are extrapolated")
     if unknown := "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown):
         blocks.append(f"not found by the calibration, too small or not driven: {unknown}")
     return [*blocks, *(finding.sentence for finding in calibration.notes)]

@@ -141,7 +141,7 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
     first = sorted(shown_rows(order), key=lambda name: name != best)
     notes = {used.name: used.fitted for used in report.calibrations}
     notes |= {model.name: model.knows for model in report.models if kind_of(model.name) == TOPIC_ROW}
-    # a given calibration changes the numbers of this row
+    # A given calibration changes the numbers of this row.
     learned = (model for model in report.models if kind_of(model.name) == "adaptive")
     notes |= {model.name: "from the calibration" for model in learned if not model.knows.startswith(OTHER_ROBOTS)}
     if report.best is not None:
@@ -236,7 +236,7 @@ def sensor_lines(report: DropoutDocument) -> Iterator[str]:
 def as_good_lines(report: DropoutDocument) -> Iterator[str]:
     """Yield a line with the rows for comparison that are as good as the best row."""
     for name in report.best.as_good if report.best is not None else ():
-        yield f"{name} ({row_of(name).words}) is not shown to be worse: it needs no calibration"
+        yield f"{name} ({row_of(name).words}) is not shown to be worse, and needs no calibration"
 
 
 def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
@@ -281,7 +281,7 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
     head = ("", "from", "error", "no_slip", "turn", "mean speed", up, across, "meanwhile")
     caption = (
         f"Trials of {first.horizon_m:g} m with the largest error of {first.model} that do not "
-        "overlap. What they share (a speed, a turn, a place) is where the model fails"
+        "overlap. What they share (a speed, a turn, a place) shows where the model fails"
     )
     moments = [trial.t_s for trial in report.worst]
     worst = Table("lrrrrrrrl", rows[:1], head, caption, moments[:1])

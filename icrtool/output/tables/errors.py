@@ -38,7 +38,7 @@ NO_TRIAL = {
 
 
 def shown_horizons(horizons_m: Floats) -> list[int]:
-    """Return the places of the horizons (h,) nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
+    """Return the indices of the horizons (h,) nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
     if len(horizons_m) <= len(SHOWN_HORIZONS_M):
         return list(range(len(horizons_m)))
     nearest = (int(np.argmin(np.abs(horizons_m - metres))) for metres in SHOWN_HORIZONS_M)
@@ -180,7 +180,7 @@ def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
     cost, icr, events = report.without_events, model_of(report, "icr"), summary.events
     if cost is None and events:
         lasted = duration_text(sum(event.end_s - event.begin_s for event in events))
-        return [f"trials cross {counted(len(events), 'slip event')}, {lasted} in all: --without-events leaves them out"]
+        return [f"trials cross {counted(len(events), 'slip event')}, {lasted} in all; --without-events leaves them out"]
     if cost is None or icr is None:
         return []
     if not cost.events:

@@ -58,11 +58,11 @@ def info_blocks(
 
     Parameters
     ----------
-    survey, log, run : as far as reading and fitting came; a table has no survey
-    problem : why the log cannot be fitted
-    names : of the log, and its path; they stand before the problem where it is printed alone
-    command : to run next
-    scorable : topics of poses that are not the reference
+    survey, log, run : results of reading and fitting; None for a step that failed. A table has no survey
+    problem : the error because of which the log cannot be fitted
+    names : name and path of the log, which stand before the problem where it is printed alone
+    command : the command to run next
+    scorable : topics with poses that are not the reference
     """
     decision, good = verdict(run, problem, names), run is not None and run.usable
     rows: list[Row] = []
@@ -158,6 +158,7 @@ def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | N
 
 
 def _topic_text(topic: SurveyedTopic) -> str:
+    """Return number, rate and gaps of the messages of a topic, or why the topic was not read."""
     if topic.not_read_because is not None and not topic.read:
         return f"not read: {topic.not_read_because}"
     parts = [] if topic.messages is None else [counted(topic.messages, "message")]

@@ -76,7 +76,7 @@ Row = tuple[str, str]
 
 
 def format_run(run: Run) -> str:
-    """Return all that is printed of a run; at most 100 columns wide, no line end.
+    """Return a run as text, at most 100 columns wide, without the last line end.
 
     Warnings are not in it: they belong to stderr.
     """
@@ -170,7 +170,7 @@ def warnings_line(notes: Sequence[Note]) -> str:
 
 
 def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None) -> list[Block]:
-    """Return the numbers for a controller, by the run or as `fitted`, and the ICRs that they come from."""
+    """Return the numbers for a controller, of the run or `fitted`, and the ICRs from which they are computed."""
     width_m, icrs = summary.config.robot.track_width_m, [summary.icr_of_drive(column) for column in ICR_COLUMNS]
     numbers = fitted or summary.controller
     if width_m is not None and numbers is not None:
@@ -198,6 +198,7 @@ def blocks_of_numbers(
 
 
 def _icr_row(icrs: Sequence[tuple[float, float] | None]) -> Row:
+    """Return the row with the ICRs and their standard deviations; None for an ICR that is not known."""
     named_icrs = zip(ICR_WORDS.values(), icrs, strict=True)
     return "ICRs [m]", ", ".join(
         f"{word.removeprefix('y ')} {icr_text(*(icr or (None, None)))}" for word, icr in named_icrs

@@ -34,7 +34,7 @@ SHOWN: dict[str, dict[str, str]] = {
 
 
 def study_blocks(result: StudyResult) -> list[Block]:
-    """Return the tables of a study, at most 80 columns wide without the paper's numbers; no line end."""
+    """Return the tables of a study, at most 80 columns wide without the paper's numbers."""
     request, study = result.request, result.study
     figures = f" (Fig{'s' if len(study.figures) > 2 else ''}. {study.figures})" if study.figures else ""
     icrs = ", ".join(f"{icr:+z.3f}" for icr in request.plan.icrs_m)

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from icrtool.output.figures.calibrations import FleetNumbers, fleet_errors, fleet_icrs
-from icrtool.output.figures.style import drawable, new_figure, picture_bytes, save_figure, style
+from icrtool.output.figures.style import drawable_text, new_figure, picture_bytes, save_figure, style
 from icrtool.records.fleet_document import FleetLog
 
 HOSTILE = ("a$b^{$", "$\\frac{$", "\u6f22\u5b57", "\x1b[2J", "\udc80.mcap", "line\nbreak", "\U0010ffff", "\u202egpj")
@@ -24,7 +24,7 @@ def test_a_hostile_name_is_drawn_as_text(tmp_path: Path, name: str) -> None:
     with warnings.catch_warnings(), style():
         warnings.simplefilter("error")
         save_figure(new_figure(name, name, width_in=3.0, height_in=2.0), tmp_path / "title", ("png", "svg", "pdf"))
-    assert drawable(name).isprintable()
+    assert drawable_text(name).isprintable()
 
 
 MOST_APART, MEAN_APART = 24, 0.5
@@ -32,7 +32,7 @@ MOST_APART, MEAN_APART = 24, 0.5
 
 
 def test_an_ordinary_name_is_unchanged() -> None:
-    assert drawable("drive 12 – é, ±2σ, 4 m²") == "drive 12 – é, ±2σ, 4 m²"
+    assert drawable_text("drive 12 – é, ±2σ, 4 m²") == "drive 12 – é, ±2σ, 4 m²"
 
 
 def test_every_robot_of_a_fleet_has_its_name_in_the_key(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_every_robot_of_a_fleet_has_its_name_in_the_key(tmp_path: Path) -> None:
         for draw in (fleet_icrs, fleet_errors):
             save_figure(draw(fleet), tmp_path / "fleet", ("png", "svg"))
     shown = [text.get_text().strip() for text in fleet_icrs(fleet).legends[0].get_texts()]
-    assert sorted(shown) == sorted(drawable(name, 24) for name in names)
+    assert sorted(shown) == sorted(drawable_text(name, 24) for name in names)
 
 
 def test_every_log_of_a_fleet_has_its_name_its_date_and_its_icrs_with_sigma() -> None:

@@ -328,7 +328,7 @@ def test_the_newest_run_is_that_of_the_youngest_run_json(tmp_path: Path, run: Ru
 
 
 def test_no_run_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="no run in it; name a run directory or a log, or make a run with icrtool fit"):
+    with pytest.raises(RunError, match="holds no run; name a run directory or a log, or make a run with icrtool fit"):
         newest_run(tmp_path / "icrtool-runs")
 
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from icrtool.output.series import (
     breaks_after,
-    every_so_many,
+    evenly_spaced_rows,
     extremes,
-    places,
     round_steps,
+    rows_entering_cells,
     scale_end_m,
     scale_of,
 )
@@ -58,7 +58,7 @@ def test_short_columns_are_left_whole() -> None:
 def test_a_path_keeps_a_point_in_every_cell_it_enters() -> None:
     way = np.linspace(0, 20 * np.pi, 200_000)
     north, east = 10 * np.cos(way), 10 * np.sin(way)
-    shown = places(north, east, 0.5)
+    shown = rows_entering_cells(north, east, 0.5)
     assert shown[0] == 0
     assert shown[-1] == len(way) - 1
     step = np.hypot(np.diff(north[shown]), np.diff(east[shown]))
@@ -68,7 +68,7 @@ def test_a_path_keeps_a_point_in_every_cell_it_enters() -> None:
 
 @pytest.mark.parametrize("rows", [0, 1])
 def test_hardly_any_path_is_no_trouble(rows: int) -> None:
-    assert len(places(np.zeros(rows), np.zeros(rows), 1.0)) == rows
+    assert len(rows_entering_cells(np.zeros(rows), np.zeros(rows), 1.0)) == rows
 
 
 def test_a_line_breaks_where_nothing_was_measured_for_long() -> None:
@@ -86,8 +86,8 @@ def test_a_few_outliers_do_not_flatten_a_scale_of_differences() -> None:
 
 
 @given(st.integers(1, 5000), st.floats(1.0, 600.0))
-def test_every_so_many_rows_end_with_the_last_one(rows: int, most: float) -> None:
-    chosen, every = every_so_many(rows, most)
+def test_evenly_spaced_rows_end_with_the_last_one(rows: int, most: float) -> None:
+    chosen, every = evenly_spaced_rows(rows, most)
     assert (chosen[0], chosen[-1]) == (0, rows - 1)
     assert set(np.diff(chosen[:-1]).tolist()) <= {every}
     assert len(chosen) <= most + 2

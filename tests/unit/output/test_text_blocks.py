@@ -20,10 +20,10 @@ from icrtool.output.text_blocks import (
     Line,
     Section,
     Table,
-    fitted_to,
+    filled_blocks,
+    fit_table,
     format_blocks,
     format_markdown,
-    stated_blocks,
 )
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, SensorDocument, SensorDrive
 from icrtool.records.run import Run
@@ -49,7 +49,7 @@ def test_a_table_that_is_too_wide_cuts_no_number_of_a_run(run: Run, width: int) 
     tables = list(tables_of(run_blocks(run.document)))
     assert len(tables) > 1
     for table in tables:
-        narrow, left_out = fitted_to(table, width, 3)
+        narrow, left_out = fit_table(table, width, 3)
         shown = {cell for row in narrow.rows for cell in row if "…" in cell}
         assert [cell for cell in shown if "±" in cell or cell.startswith(("+", "-"))] == []
         assert len(narrow.head) + len(left_out) == len(table.head)
@@ -58,7 +58,7 @@ def test_a_table_that_is_too_wide_cuts_no_number_of_a_run(run: Run, width: int) 
 
 def test_a_table_without_rows_is_nothing() -> None:
     assert format_blocks([Table("lr", [])]) == ""
-    assert fitted_to(Table("lr", []), 60, 3) == (Table("", []), [])
+    assert fit_table(Table("lr", []), 60, 3) == (Table("", []), [])
 
 
 def test_what_is_empty_in_a_document_is_left_out() -> None:
@@ -75,11 +75,11 @@ def test_what_is_empty_in_a_document_is_left_out() -> None:
         Section("Part", [Section("Inner", empty)], name="part"),
         Facts([("a", "1"), ("b", "")]),
     ]
-    assert list(stated_blocks(blocks)) == ["before", Facts([("a", "1")])]
+    assert list(filled_blocks(blocks)) == ["before", Facts([("a", "1")])]
     assert format_blocks(blocks).splitlines() == ["before", "a           1"]
     assert "Part" not in format_markdown(blocks)
     lead = Section("Answer", [], lead="yes", label="Trust?")
-    assert list(stated_blocks([lead])) == [lead]
+    assert list(filled_blocks([lead])) == [lead]
 
 
 def test_markdown_has_a_heading_a_section_an_item_a_sentence_and_escapes_names() -> None:
