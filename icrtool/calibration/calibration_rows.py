@@ -78,28 +78,28 @@ def calibrated_drive(
     Held constants include the corrections before a fit, so the corrections of this log are subtracted from them. The
     bias of a gyro begins at the held bias, and is learned from the turns before each start.
     """
-    fitted = model_for(calibration, recording, with_gyro=with_gyro)
+    fitted_model = model_for(calibration, recording, with_gyro=with_gyro)
     total = pooled_constants(calibration.logs, recording.heading_source, with_gyro=with_gyro)
     measured = None
     with suppress(DataError):
-        measured = constants_document(measured_in(recording, cut_windows(recording), fitted))
+        measured = constants_document(measured_in(recording, cut_windows(recording), fitted_model))
     sensors = HeldSensors(constants_document(total), measured, refit_sensors)
     names = [name for name in CONSTANT_WORDS if with_gyro or not name.startswith("gyro")]
     if refit_sensors:
-        own_values = own_constants(cut_windows(recording), fitted, recording.width_m)
+        own_values = own_constants(cut_windows(recording), fitted_model, recording.width_m)
         knows = f"{words_of(names)} refitted in this drive (--refit-sensors)"
-        return CalibratedDrive(KnownDrive(recording, (_learned(fitted, own_values),)), sensors, knows, ())
+        return CalibratedDrive(KnownDrive(recording, (_learned(fitted_model, own_values),)), sensors, knows, ())
     remaining = remaining_constants(total, recording.corrected)
     unknown = [name for name in names if getattr(sensors.held, name) is None]
     # A model without a gyro uses no constants of a gyro.
     constants = remaining.usual().mean
     if unknown:
-        constants = own_constants(cut_windows(recording), fitted, recording.width_m, remaining.mean)
-    learned: tuple[Learned, ...] = (_learned(fitted, constants),)
+        constants = own_constants(cut_windows(recording), fitted_model, recording.width_m, remaining.mean)
+    learned: tuple[Learned, ...] = (_learned(fitted_model, constants),)
     if with_gyro:
         usual = remaining.usual()
         constants = constants._replace(gyro_bias_radps=usual.mean.gyro_bias_radps)
-        learned = _with_biases(recording if past is None else past, fitted, constants, usual.std.gyro_bias_radps)
+        learned = _with_biases(recording if past is None else past, fitted_model, constants, usual.std.gyro_bias_radps)
     knows = _knows([name for name in names if name not in unknown], unknown)
     # Both rows of a calibration hold offset and delay, so a contradiction is noted for the first row only.
     notes = contradictions(row, sensors, ["gyro_delay_s"] if with_gyro else names)
@@ -118,13 +118,13 @@ def _knows(held: Sequence[str], unknown: Sequence[str]) -> str:
     return ", ".join(parts)
 
 
-def _learned(fitted: FittedModel, constants: LogConstants, since_s: float = -np.inf) -> Learned:
+def _learned(fitted_model: FittedModel, constants: LogConstants, since_s: float = -np.inf) -> Learned:
     """Return a model and constants that are known from a time [s] on."""
-    return Learned(since_s, 0.0, fitted, constants)
+    return Learned(since_s, 0.0, fitted_model, constants)
 
 
 def _with_biases(
-    past: Recording, fitted: FittedModel, constants: LogConstants, std_radps: float
+    past: Recording, fitted_model: FittedModel, constants: LogConstants, std_radps: float
 ) -> tuple[Learned, ...]:
     """Return a model with a gyro and its constants, with the bias that the turns before each time show.
 
@@ -133,10 +133,10 @@ def _with_biases(
     constants : constants with the bias that is known before the drive
     std_radps : standard deviation of this bias [rad/s]
     """
-    path = predicted_path(past, fitted, constants)
+    path = predicted_path(past, fitted_model, constants)
     lines = past_lines(past.track, lambda rows: path(past.track.t[rows])[0], (0.0, std_radps))
     known_s = [-np.inf, *past.track.t[lines.row[1:]].tolist()]
     return tuple(
-        _learned(fitted, constants._replace(gyro_bias_radps=constants.gyro_bias_radps + bias), since_s)
+        _learned(fitted_model, constants._replace(gyro_bias_radps=constants.gyro_bias_radps + bias), since_s)
         for since_s, bias in zip(known_s, lines.bias_radps.tolist(), strict=True)
     )

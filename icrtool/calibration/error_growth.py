@@ -92,29 +92,29 @@ class PathErrors(NamedTuple):
 
 
 def path_errors(
-    windows: Windows, fitted: FittedModel, width_m: float, constants: LogConstants = NO_CONSTANTS
+    windows: Windows, fitted_model: FittedModel, width_m: float, constants: LogConstants = NO_CONSTANTS
 ) -> PathErrors:
     """Return displacement and turn of windows by a model, and the moments of their errors.
 
     Parameters
     ----------
-    fitted, width_m : the model, and the track width b [m]
+    fitted_model, width_m : the model, and the track width b [m]
     constants : constants of the recording
     """
     steps = windows.track
     gyro = None if steps.gyro is None else steps.gyro + constants.gyro_later_s * steps.gyro_change()
     motion = wheel_motion(steps.v_left, steps.v_right, width_m, gyro)
-    fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
+    fixed, axes, columns = model_columns(fitted_model.model, fitted_model.complete(motion))
     fixed[OMEGA] += constants.gyro_bias_radps
     # The sources act along the whole path, not only at the ends of the windows.
     of_start, of_end = (steps.place_t[rows] + constants.wheels_later_s for rows in (windows.begin, windows.end))
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
-    path = path_at(steps, lambda rows: (fixed[:, rows], axes, columns[:, rows]), fitted.parameters, at)
+    path = path_at(steps, lambda rows: (fixed[:, rows], axes, columns[:, rows]), fitted_model.parameters, at)
     s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)
     moved, by = displacements(path, s, e)
     moved_by, turned_by = by[:-1], path.heading_by[:, e] - path.heading_by[:, s]
     of_parameters = Spread(
-        *(np.einsum("kw,kl,lw->w", a, fitted.covariance, b)[:, None]
+        *(np.einsum("kw,kl,lw->w", a, fitted_model.covariance, b)[:, None]
           for a, b in ((turned_by, turned_by), (moved_by.real, moved_by.real), (moved_by.real, moved_by.imag),
                        (moved_by.imag, moved_by.imag)))
     )  # fmt: skip
@@ -310,7 +310,7 @@ def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro:
     return _along(calibration, recording.track, steps_of(recording), with_gyro=with_gyro)
 
 
-def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
+def wheel_speeds(fitted_model: FittedModel, width_m: float, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
     """Return left and right speeds (n,) [m/s] for which a model gives a forward speed [m/s] and a turn rate [rad/s].
 
     Notes
@@ -320,7 +320,7 @@ def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Float
 
     def ahead_and_turn(v: Floats, w: Floats) -> Floats:
         """Return v_x and omega (2, n) of the model."""
-        return fitted.twist(wheel_motion(v + w * width_m / 2.0, v - w * width_m / 2.0, width_m))[[VX, OMEGA]]
+        return fitted_model.twist(wheel_motion(v + w * width_m / 2.0, v - w * width_m / 2.0, width_m))[[VX, OMEGA]]
 
     v, w = speed.copy(), turn.copy()
     for _ in range(INVERSIONS):
@@ -361,12 +361,12 @@ def forecast_errors(calibration: Calibration, windows: Windows, *, with_gyro: bo
     DataError
         The calibration has no sources of error.
     """
-    fitted, sources = calibration.fitted, calibration.error_sources
+    fitted_model, sources = calibration.fitted, calibration.error_sources
     if with_gyro and calibration.gyro is not None and (turned := calibration.fitted_with_gyro) is not None:
-        fitted, sources = turned, calibration.gyro.error_sources
+        fitted_model, sources = turned, calibration.gyro.error_sources
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
-    growth = path_errors(windows, fitted, calibration.width_m)
+    growth = path_errors(windows, fitted_model, calibration.width_m)
     spread = growth.of_sources.combined(np.array(astuple(sources)[:SOURCES])).plus(growth.of_parameters)
     return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius_of_share(spread, 0.95)

@@ -370,8 +370,8 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     """
     of_logs: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
     tested = [np.empty((0, 3))]
-    for i, windows, (fitted, constants) in _left_out_windows(table, name, LENGTHS_M):
-        errors = error_growth.path_errors(windows, fitted, table.recordings[i].width_m, constants)
+    for i, windows, (fitted_model, constants) in _left_out_windows(table, name, LENGTHS_M):
+        errors = error_growth.path_errors(windows, fitted_model, table.recordings[i].width_m, constants)
         reference = np.exp(-1j * constants.heading_offset_rad) * windows.moved
         of_logs.append((windows.length_m, errors, errors.turned - windows.turned, errors.moved - reference))
         stretch = np.floor(windows.track.distance[windows.begin] / windows.length_m)

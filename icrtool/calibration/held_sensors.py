@@ -43,25 +43,25 @@ _TO_DOCUMENT = np.array([math.degrees(1.0), -1.0, math.degrees(1.0), 1.0])
 
 
 def sensors_of(
-    recording: Recording, windows: Windows, fitted: FittedModel, turned: FittedModel | None = None
+    recording: Recording, windows: Windows, fitted_model: FittedModel, turned: FittedModel | None = None
 ) -> documents.LogSensors:
     """Return the constants of a recording's sensors, with the corrections before the fit.
 
     Parameters
     ----------
     windows : windows of the recording
-    fitted, turned : models of the calibration, with wheels alone and with a gyro
+    fitted_model, turned : models of the calibration, with wheels alone and with a gyro
     """
     of_models = [
         None if model is None else constants_document(measured_in(recording, windows, model))
-        for model in (fitted, turned)
+        for model in (fitted_model, turned)
     ]
     return documents.LogSensors(recording.heading_source, of_models[0] or documents.SensorConstants(), of_models[1])
 
 
-def measured_in(recording: Recording, windows: Windows, fitted: FittedModel) -> KnownConstants:
+def measured_in(recording: Recording, windows: Windows, fitted_model: FittedModel) -> KnownConstants:
     """Return the constants that a recording's sensors had before any correction, for the parameters of a model."""
-    constants = measured_constants(windows, fitted, recording.width_m)
+    constants = measured_constants(windows, fitted_model, recording.width_m)
     return KnownConstants(recording.corrected.plus(constants.mean), constants.std)
 
 

@@ -77,10 +77,13 @@ def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit])
     windows = cut_windows(recording)
     for suffix in ("", GYRO_SUFFIX) if has_gyro else ("",):
         five_terms, eight_terms = (fits[f"{name}{suffix}"].fitted for name in (FIVE, RECOMMENDED))
-        for name, fitted in (
+        for name, fitted_model in (
             (CONTROLLER, controller_model(five_terms, recording.lever, recording.width_m)), (RECOMMENDED, eight_terms),
         ):  # fmt: skip
-            yield f"{name}{suffix}", _held(recording, trials, fitted, own_constants(windows, fitted, recording.width_m))
+            yield (
+                f"{name}{suffix}",
+                _held(recording, trials, fitted_model, own_constants(windows, fitted_model, recording.width_m)),
+            )
     gyro_model = turned.fitted if turned is not None else None
     drive = adapt(recording, prior_of_model(recording.width_m, fits[RECOMMENDED].fitted, gyro_model, "other grounds"))
     yield "adaptive", drive.errors(trials).position
@@ -88,10 +91,10 @@ def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit])
         yield f"adaptive{GYRO_SUFFIX}", drive.errors(trials, turned=True).position
 
 
-def _held(recording: Recording, trials: Trials, fitted: FittedModel, constants: LogConstants) -> Floats:
+def _held(recording: Recording, trials: Trials, fitted_model: FittedModel, constants: LogConstants) -> Floats:
     """Return the errors (k, h) [m] of a model with its constants in trials of a recording."""
     return errors_without(
-        recording, trials, [Fold("", 0, 0, -np.inf, np.inf)], 0, lambda _: (fitted, constants)
+        recording, trials, [Fold("", 0, 0, -np.inf, np.inf)], 0, lambda _: (fitted_model, constants)
     ).position
 
 

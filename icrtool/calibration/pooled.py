@@ -132,10 +132,10 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | 
     return replace(plain, track=track, gyro_reversed=line.scale < 0.0, corrected=corrected)
 
 
-def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
-    """Return the recording of a run with its measured heading of a kind (``gyro`` or ``heading``), if it has one."""
+def turning_recording_of(run: Run, turn_sensor: str = "gyro", *, width_m: float | None = None) -> Recording:
+    """Return the recording of a run with the turns of a sensor (``gyro`` or ``heading``), if the run has it."""
     return recording_of(
-        run, next((heading for heading in measured_headings(run) if heading.kind == kind), None), width_m=width_m
+        run, next((heading for heading in measured_headings(run) if heading.kind == turn_sensor), None), width_m=width_m
     )
 
 
@@ -310,8 +310,8 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
     """Return a function that gives the errors of a calibration in trials of a recording, with its own constants."""
-    fitted = model_for(calibration, recording, with_gyro=with_gyro)
-    fit = fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
+    fitted_model = model_for(calibration, recording, with_gyro=with_gyro)
+    fit = fitted_model, own_constants(cut_windows(recording), fitted_model, recording.width_m)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]
     return lambda trials: held_out.errors_without(recording, trials, folds, 0, lambda _: fit)
 

@@ -87,8 +87,8 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     name: str | UnsetType = UNSET
 
     def __post_init__(self) -> None:
-        for name, fitted in self.models.items():
-            fitted_model(name, fitted)
+        for name, document in self.models.items():
+            model_in_document(name, document)
         _ = self.fitted_with_gyro
         if not set(TrackGeometry._fields) <= self.geometry.keys() & self.geometry_std.keys():
             raise ValueError("its geometry is not complete")
@@ -100,13 +100,13 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     @property
     def fitted(self) -> FittedModel:
         """The recommended model."""
-        return fitted_model(self.model, self)
+        return model_in_document(self.model, self)
 
     @property
     def fitted_with_gyro(self) -> FittedModel | None:
         """The recommended model with a gyro; None if a log has no gyro."""
         gyro = self.gyro
-        return None if gyro is None else replace(fitted_model(gyro.model, gyro), wheels=self.fitted)
+        return None if gyro is None else replace(model_in_document(gyro.model, gyro), wheels=self.fitted)
 
     @property
     def width_m(self) -> float:
@@ -116,7 +116,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     def _geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs [m], multiplier and radius factors, from one fit, and their covariance (6, 6)."""
         five = self.models.get(FIVE)
-        return (self.fitted if five is None else fitted_model(FIVE, five)).geometry(self.width_m)
+        return (self.fitted if five is None else model_in_document(FIVE, five)).geometry(self.width_m)
 
     @property
     def controller_errors(self) -> documents.ControllerErrors | None:
@@ -263,20 +263,21 @@ def stored_calibration(document: documents.CalibrationDocument) -> Calibration:
 
 
 def fitted_document(
-    fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: documents.CalibratedRobot, *,
+    fitted_model: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: documents.CalibratedRobot, *,
     shared_std: float | None = None,
 ) -> RecommendedDocument:  # fmt: skip
     """Return the document of a model for a robot: parameters with covariance, ICRs, and numbers for a controller.
 
     Parameters
     ----------
-    fitted : the model
+    fitted_model : the model
     geometry, covariance : ICRs, multiplier and radius factors, and their covariance (6, 6)
     robot, shared_std : as in `controller_numbers`
     """
     std = np.sqrt(np.diag(covariance)).tolist()
     return RecommendedDocument(
-        fitted.model.label, fitted.model.name, *parameter_documents(fitted), fitted.not_shown, geometry._asdict(),
+        fitted_model.model.label, fitted_model.model.name, *parameter_documents(fitted_model), fitted_model.not_shown,
+        geometry._asdict(),
         dict(zip(geometry._fields, std, strict=True)),
         controller_numbers(geometry, covariance, robot, shared_std=shared_std),
     )  # fmt: skip
@@ -313,21 +314,23 @@ def controller_numbers(
     )  # fmt: skip
 
 
-def parameter_documents(fitted: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
+def parameter_documents(
+    fitted_model: FittedModel,
+) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
     """Return terms, parameters and covariance of a model as they are stored."""
-    rows = zip(fitted.model.terms, fitted.parameters.tolist(), fitted.std.tolist(), strict=True)
-    unseen = fitted.not_shown
+    rows = zip(fitted_model.model.terms, fitted_model.parameters.tolist(), fitted_model.std.tolist(), strict=True)
+    unseen = fitted_model.not_shown
     documents_by_term = {
         name: ParameterDocument(at, std, "not shown" if name in unseen else "shown") for name, at, std in rows
     }
-    return fitted.model.terms, documents_by_term, fitted.covariance.tolist()
+    return fitted_model.model.terms, documents_by_term, fitted_model.covariance.tolist()
 
 
 LARGEST_PARAMETER = 1e6
 """Largest size of a parameter, in its unit. A larger value is damaged, and its square could overflow."""
 
 
-def fitted_model(
+def model_in_document(
     name: str, document: documents.CalibrationDocument | documents.FittedDocument | documents.GyroDocument
 ) -> FittedModel:
     """Return the motion model that a document holds.

@@ -271,19 +271,19 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
     return plain, "", notes
 
 
-def _rows(run: Run, held_out: HeldOut, kind: str, past: Recording) -> Iterator[ComparedRow]:
+def _rows(run: Run, held_out: HeldOut, turn_sensor: str, past: Recording) -> Iterator[ComparedRow]:
     """Yield the held-out rows, then the rows of the filter's ICRs with a measured heading.
 
     Parameters
     ----------
     held_out : held-out table of the run
-    kind : kind of the measured heading
+    turn_sensor : sensor of the measured heading, ``gyro`` or ``heading``
     past : the recording with the poses that were known when it was driven
     """
     for name in held_out.rows:
         if name == NO_SLIP:
             continue
-        public = name.replace(GYRO_SUFFIX, f"_{kind}")
+        public = name.replace(GYRO_SUFFIX, f"_{turn_sensor}")
         yield ComparedRow(public, partial(held_out.errors, name, 0), partial(held_out.path, name, 0))
     if held_out.has_gyro:
         (recording,) = held_out.recordings
@@ -293,7 +293,7 @@ def _rows(run: Run, held_out: HeldOut, kind: str, past: Recording) -> Iterator[C
                 of_past = model.name == "icr"
                 lines = partial(past_gyro_lines, past.track) if of_past else partial(pooled.gyro_line, recording)
                 errors_of = partial(_errors_turned, run, recording, model.icrs, lines)
-                yield ComparedRow(f"{model.name}_{kind}", errors_of, knows=model.knows)
+                yield ComparedRow(f"{model.name}_{turn_sensor}", errors_of, knows=model.knows)
 
 
 def models_of(run: Run) -> tuple[Model, ...]:

@@ -82,7 +82,7 @@ SETTING_SIGMAS = 3.0
 """Smallest difference of a proposed setting from its neutral value, in standard deviations."""
 
 
-LABELS = {key: kind.label for key, kind in FINDING_KINDS.items()} | {
+LABELS = {key: finding_kind.label for key, finding_kind in FINDING_KINDS.items()} | {
     "antenna_forward_m": "antenna forward", "antenna_right_m": "antenna right", "y_icr_right_m": "y ICR right",
     "y_icr_left_m": "y ICR left", "x_icr_m": "x ICR",
 }  # fmt: skip
@@ -102,16 +102,16 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.Sensor
         The drive is too short for an estimate.
     """
     wheels, findings = run.document.wheels, run.document.alignment
-    if not {kind.finding or key for key, kind in FINDING_KINDS.items()} <= findings.keys():
+    if not {finding_kind.finding or key for key, finding_kind in FINDING_KINDS.items()} <= findings.keys():
         metres = run.document.drive.distance_m
         why = f"{metres:.0f} m of driven distance give too few windows"
         raise DataError(run.name, why, "drive longer")
     driven, parameters = _drive(run), {}
-    for key, kind in FINDING_KINDS.items():
-        value, std = _numbers(findings[kind.finding or key])
+    for key, finding_kind in FINDING_KINDS.items():
+        value, std = _numbers(findings[finding_kind.finding or key])
         verdict: documents.SensorVerdict = "not shown"
-        if std <= WEAK * kind.useful:
-            verdict = "shown" if std <= kind.useful else "weak"
+        if std <= WEAK * finding_kind.useful:
+            verdict = "shown" if std <= finding_kind.useful else "weak"
         note = RESPONSE_PART if key in DELAYS else ""
         if verdict != "shown":
             note = _reason(key, driven)

@@ -193,7 +193,7 @@ def completion_command(shell: str) -> None:
     from icrtool.cli.commands import icrtool
 
     register_completion()
-    kind = get_completion_class(shell)
-    if kind is None:
+    completion_class = get_completion_class(shell)
+    if completion_class is None:
         raise click.UsageError(f"click has no completion for {shell}")
-    click.echo(kind(icrtool, {}, "icrtool", "_ICRTOOL_COMPLETE").source())
+    click.echo(completion_class(icrtool, {}, "icrtool", "_ICRTOOL_COMPLETE").source())

@@ -123,8 +123,8 @@ def _write_page(source: Path, output: Path | None, *, coordinates: bool, answers
         raise errors.RunError(source, "is a run at an address", advice)
     place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
     # A stranger may have put files into the folder of a result, so only a page is replaced there.
-    file, ours = (Below(place.parent, place.name), run_directory.is_page) if output is None else (place, None)
-    atomic.check_place(file, ours)
+    file, may_replace = (Below(place.parent, place.name), run_directory.is_page) if output is None else (place, None)
+    atomic.check_place(file, may_replace)
     if run_directory.is_run_directory(source):
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
             page, blocks = _page_of_run(source, coordinates=coordinates)
@@ -132,7 +132,7 @@ def _write_page(source: Path, output: Path | None, *, coordinates: bool, answers
                 printer.show(blocks)
     else:
         page = _page_of(source)
-    atomic.write_file(file, page, ours)
+    atomic.write_file(file, page, may_replace)
     printer.text(f"page        {place}")
 
 

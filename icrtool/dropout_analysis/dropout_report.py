@@ -538,9 +538,9 @@ def with_other_grounds(
     first = next(iter(scores.values()), ())
     distances = []
     for reach in budgets:
-        by, kind = turned_by(reach.model), kind_of(reach.model)
-        row = f"{RECOMMENDED if kind == 'calibration' else kind}{f'_{by}' if by else ''}"
-        of_row = {"calibration": scores.get(reach.model, ()), "adaptive": first}.get(kind, ())
+        by, row_kind = turned_by(reach.model), kind_of(reach.model)
+        row = f"{RECOMMENDED if row_kind == 'calibration' else row_kind}{f'_{by}' if by else ''}"
+        of_row = {"calibration": scores.get(reach.model, ()), "adaptive": first}.get(row_kind, ())
         ends = other_ground_ends(of_row, row, reach.budget_m)
         if ends is None:
             distances.append(reach)

@@ -182,9 +182,9 @@ def final_covariance(
     forgets = process_icr_mps**2 * REFERENCE_STEP_S
     memory_m = float(np.trace(filter_covariance)) / 3.0 / forgets if forgets > 0.0 else math.inf
     weight = np.tile(np.exp((windows.end_m - windows.end_m[-1]) / memory_m)[is_recent], 3)
-    kind, rows = np.repeat(np.arange(3), np.count_nonzero(is_recent)), np.tile(is_recent, 3)
+    direction, rows = np.repeat(np.arange(3), np.count_nonzero(is_recent)), np.tile(is_recent, 3)
     residuals, prior = windows.residuals[rows], np.diag(prior_std(width_m) ** -2.0)
-    scale = np.hypot(scale_by_kind(residuals, kind), windows.noise[kind]) / np.sqrt(weight)
+    scale = np.hypot(scale_by_kind(residuals, direction), windows.noise[direction]) / np.sqrt(weight)
     at_final_icrs = Linearised(residuals=residuals, jacobian=windows.jacobian[rows], scale=scale, prior=prior)
     slip = 1.0 if track_width_m is None else min(max(abs(width_m / track_width_m - 1.0) / SLIPS, LEAST_SLIP), 1.0)
     of_stretch = slip * width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])

@@ -170,20 +170,20 @@ def take_heading(
     x, P, run, r = state.x, state.P, state.rejected[1], data.heading_r[row]
     nu = wrap(data.heading_z[row] - x[2])
     nis = nu * nu / (P[2, 2] + r)
-    code, more = USED, 0.0
+    code, added = USED, 0.0
     if nis > parameters.heading_gate:
         code = GATED
         if rejected_run(run, state.reached[0], nu, 0.0, parameters.heading_gate * 2.0 * r, parameters):
             code = RECOVERED
-            more = nu * nu
-            P[2, 2] += more
+            added = nu * nu
+            P[2, 2] += added
     if code != GATED:
         run[0] = 0.0
         S = measured_column(P, PSI, 0.0, PH) + r * parameters.heading_correlation
         correct(x, P, PH, S, nu, None, 6)
         keep_sides(x, P, parameters.least_icr)
     out.heading_code[row], out.heading_nis[row], out.heading_innovation[row] = code, nis, nu
-    return 0.0, 0.0, more
+    return 0.0, 0.0, added
 
 
 @njit_part
@@ -238,12 +238,12 @@ def begin_node(nodes: Nodes, m: int, state: FilterState, dt: float, G: Floats) -
 
 
 @njit_part
-def end_node(nodes: Nodes, m: int, state: FilterState, row: int, more: tuple[float, float, float]) -> None:
+def end_node(nodes: Nodes, m: int, state: FilterState, row: int, added: tuple[float, float, float]) -> None:
     """Store in node m the state after an event, the variances that the event added to P, and the wheel sample."""
     store(state.x, state.P, nodes.x, nodes.P, m)
     nodes.row[m] = row
     for axis in range(3):
-        nodes.P_predicted[m, axis, axis] += more[axis]
+        nodes.P_predicted[m, axis, axis] += added[axis]
 
 
 @njit_part
@@ -269,7 +269,7 @@ def filter_events(
     count, recorded, k = 0, True, begin
     for i in range(len(events.t)):
         kind, row, dt = events.kind[i], events.row[i], events.t[i] - state.reached[0]
-        more = (0.0, 0.0, 0.0)
+        added = (0.0, 0.0, 0.0)
         if dt > 0.0:
             advance(dt, data, k, state, parameters, space)
             state.reached[0] = events.t[i]
@@ -280,15 +280,15 @@ def filter_events(
             begin_node(nodes, count, state, dt, space.G)
             count += 1
         if kind == FIX:
-            more = take_fix(data, row, state, parameters, space.PH, out)
+            added = take_fix(data, row, state, parameters, space.PH, out)
         elif kind == HEADING:
-            more = take_heading(data, row, state, parameters, space.PH, out)
+            added = take_heading(data, row, state, parameters, space.PH, out)
         recorded = kind == WHEELS
         if recorded:
             record(state, out.states, row - first)
             k = row + 1
         if nodes is not None:
-            end_node(nodes, count - 1, state, row if recorded else -1, more)
+            end_node(nodes, count - 1, state, row if recorded else -1, added)
     return count
 
 

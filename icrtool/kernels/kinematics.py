@@ -123,21 +123,21 @@ def _arcs(heading: Floats, v_left: Floats, v_right: Floats, icrs: Floats, dt: Fl
     return np.column_stack([chord.real, chord.imag, omega * dt])
 
 
-def drive(t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, which: Ints, start: Floats) -> Floats:
+def drive(t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, icr_row: Ints, start: Floats) -> Floats:
     """Return the true pose of a robot with known ICRs at every time.
 
     Parameters
     ----------
     t : (n,) increasing [s]
     v_left, v_right : (n,) track speeds [m/s], held over [k, k+1)
-    icrs : (c, 3) y_icr_right, y_icr_left, x_icr [m]; which : (n,) row of `icrs` that holds over [k, k+1)
+    icrs : (c, 3) y_icr_right, y_icr_left, x_icr [m]; icr_row : (n,) row of `icrs` that holds over [k, k+1)
     start : (3,) N, E [m], psi [rad] at t[0]
 
     Returns
     -------
     (n, 3) N, E [m], psi [rad] (unwrapped)
     """
-    held, held_icrs, dt = slice(len(t) - 1), icrs[which[:-1]], np.diff(t)
+    held, held_icrs, dt = slice(len(t) - 1), icrs[icr_row[:-1]], np.diff(t)
     turned = dt * body_velocity(v_left[held], v_right[held], *held_icrs.T)[2]
     heading = np.cumsum(np.append(start[2], turned))
     moved = _arcs(heading[:-1], v_left[held], v_right[held], held_icrs, dt)
@@ -145,11 +145,11 @@ def drive(t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, which: Ints,
 
 
 def poses_at(
-    times: Floats, t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, which: Ints, pose: Floats
+    times: Floats, t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, icr_row: Ints, pose: Floats
 ) -> Floats:
     """Return the pose (m, 3) at any times (m,) between those of `drive`, on the arcs it drove."""
     k = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 1)
-    return np.asarray(pose[k] + _arcs(pose[k, 2], v_left[k], v_right[k], icrs[which[k]], times - t[k]))
+    return np.asarray(pose[k] + _arcs(pose[k, 2], v_left[k], v_right[k], icrs[icr_row[k]], times - t[k]))
 
 
 def follow(command: Floats, t: Floats, lag_s: float) -> Floats:

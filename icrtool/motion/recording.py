@@ -324,7 +324,7 @@ def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> 
 
 
 def predicted_path(
-    recording: Recording, fitted: FittedModel, constants: LogConstants = NO_CONSTANTS, steps: Track | None = None
+    recording: Recording, fitted_model: FittedModel, constants: LogConstants = NO_CONSTANTS, steps: Track | None = None
 ) -> PathAt:
     """Return a function for the path that a model makes of a recording's wheels and gyro, at times of its poses.
 
@@ -347,7 +347,7 @@ def predicted_path(
         if gyro is not None and constants.gyro_later_s:
             gyro = gyro + constants.gyro_later_s * driven.gyro_change(rows)
         motion = wheel_motion(wheels.v_left, wheels.v_right, recording.width_m, gyro)
-        moving = fitted.twist(motion)
+        moving = fitted_model.twist(motion)
         moving[OMEGA] += constants.gyro_bias_radps
         return moving, np.empty(0, np.int64), np.empty((0, len(motion.v)))
 

@@ -55,14 +55,16 @@ def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
     return TermsPrior.of_wheels(track_width_m, np.array(mean), np.diag(variance), OTHER_ROBOTS)
 
 
-def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedModel | None, source: str) -> TermsPrior:
+def prior_of_model(
+    track_width_m: float, fitted_model: FittedModel, turned: FittedModel | None, source: str
+) -> TermsPrior:
     """Return the prior for the next drive of a robot from its fitted models.
 
     Parameters
     ----------
     track_width_m : track width b
-    fitted, turned : models with wheels alone, and with a gyro; None: without one. Terms that both lack have the prior
-        of `prior_of_robots`
+    fitted_model, turned : models with wheels alone, and with a gyro; None: without one. Terms that both lack have the
+        prior of `prior_of_robots`
     source : source of the prior, in a few words
 
     Notes
@@ -70,7 +72,7 @@ def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedMode
     The covariance is the sum of the parameters' covariance and the covariance between drives (`between_drives`).
     """
     of_robots = prior_of_robots(track_width_m)
-    mean, covariance = _placed(WHEELS_MODEL.terms, of_robots.mean, of_robots.covariance, fitted)
+    mean, covariance = _placed(WHEELS_MODEL.terms, of_robots.mean, of_robots.covariance, fitted_model)
     prior = TermsPrior.of_wheels(track_width_m, mean, covariance, source)
     if turned is None:
         return prior
@@ -79,16 +81,16 @@ def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedMode
 
 
 def _placed(
-    terms: tuple[str, ...], mean: Floats, covariance: Floats, fitted: FittedModel
+    terms: tuple[str, ...], mean: Floats, covariance: Floats, fitted_model: FittedModel
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Return mean and covariance of terms; the terms of a fitted model get their prior for a further drive."""
-    names = fitted.model.terms
+    names = fitted_model.model.terms
     of_fit = [names.index(name) for name in terms if name in names]
     at = [terms.index(name) for name in terms if name in names]
     mean, covariance = mean.copy(), covariance.copy()
-    mean[at] = fitted.parameters[of_fit]
+    mean[at] = fitted_model.parameters[of_fit]
     covariance[at, :] = covariance[:, at] = 0.0
-    covariance[np.ix_(at, at)] = (fitted.covariance + between_drives(names))[np.ix_(of_fit, of_fit)]
+    covariance[np.ix_(at, at)] = (fitted_model.covariance + between_drives(names))[np.ix_(of_fit, of_fit)]
     return mean, covariance
 
 

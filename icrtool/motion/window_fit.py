@@ -288,8 +288,8 @@ class PooledFit(FittedModel):
         if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
             refit = self.refit_without(i)
             covariance = self._covariance(np.linalg.inv(refit.curvature)[:k, :k])
-            fitted = replace(refit.fitted, covariance=covariance)
-            return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
+            fitted_model = replace(refit.fitted, covariance=covariance)
+            return fitted_model, own_constants(pool.windows[i], fitted_model, pool.widths_m[i])
         of_wheels = None if self.wheels is None else self.wheels.without(fold)
         wheels = None if of_wheels is None else of_wheels[0]
         shown = None if self.wide is None else self.wide.without(fold)
@@ -303,9 +303,9 @@ class PooledFit(FittedModel):
             # This is a Newton step. At the minimum the gradients of all residuals and of the prior sum to zero, so the
             # gradient without the fold is the negative gradient of the fold.
             steps = np.linalg.solve(self.curvature - curvature, gradient)
-            fitted = FittedModel(model, self.parameters + steps, covariance, wheels)
+            fitted_model = FittedModel(model, self.parameters + steps, covariance, wheels)
             constants = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
-            return fitted, LogConstants(*constants.tolist())
+            return fitted_model, LogConstants(*constants.tolist())
         x, covariance = self._reweighted(clear, model)
         return FittedModel(model, x[:k], covariance, wheels), LogConstants(*self._own(x, i).tolist())
 
@@ -399,25 +399,27 @@ UNKNOWN_CONSTANTS = KnownConstants(LogConstants(), LogConstants(*CONSTANT_STD.to
 
 
 def own_constants(
-    windows: Windows, fitted: FittedModel, width_m: float, held: LogConstants | None = None
+    windows: Windows, fitted_model: FittedModel, width_m: float, held: LogConstants | None = None
 ) -> LogConstants:
     """Return the constants of one recording for given parameters of the model.
 
     Parameters
     ----------
     windows : windows of the recording
-    fitted, width_m : the model, and the track width b [m]
+    fitted_model, width_m : the model, and the track width b [m]
     held : constants that keep their values; a constant that is NaN is estimated. Default: all are estimated
     """
-    held_values = np.full(len(constant_std(fitted.model)), np.nan)
+    held_values = np.full(len(constant_std(fitted_model.model)), np.nan)
     if held is not None:
         held_values = np.array(held)[: len(held_values)]
     if not np.isnan(held_values).any():
         return LogConstants(*held_values.tolist())
-    return LogConstants(*_fit_constants(windows, fitted, width_m, held_values, len(windows.begin) / 5.0)[0].tolist())
+    return LogConstants(
+        *_fit_constants(windows, fitted_model, width_m, held_values, len(windows.begin) / 5.0)[0].tolist()
+    )
 
 
-def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) -> KnownConstants:
+def measured_constants(windows: Windows, fitted_model: FittedModel, width_m: float) -> KnownConstants:
     """Return the constants of one recording for given parameters of the model, with their standard deviations.
 
     Notes
@@ -426,19 +428,19 @@ def measured_constants(windows: Windows, fitted: FittedModel, width_m: float) ->
     is not part of the standard deviations, because constants are used with the parameters they were measured with.
     """
     pool = Pool([windows], [width_m])
-    unknown = np.full(len(constant_std(fitted.model)), np.nan)
-    constants, fit = _fit_constants(windows, fitted, width_m, unknown, pool.overlap)
+    unknown = np.full(len(constant_std(fitted_model.model)), np.nan)
+    constants, fit = _fit_constants(windows, fitted_model, width_m, unknown, pool.overlap)
     std = np.sqrt(np.diag(student_covariance(fit, [pool.group])))
     without = np.full(len(CONSTANT_STD) - len(unknown), np.nan)
     return KnownConstants(*(LogConstants(*np.append(values, without).tolist()) for values in (constants, std)))
 
 
 def _fit_constants(
-    windows: Windows, fitted: FittedModel, width_m: float, known: Floats, overlap: float
+    windows: Windows, fitted_model: FittedModel, width_m: float, known: Floats, overlap: float
 ) -> tuple[Floats, RobustFit]:
     """Return all constants (c,), and the fit of those that are NaN in `known` (c,); `overlap` as in `Linearised`."""
-    of_both, free = residuals_of(windows, fitted.model, width_m, fitted.wheels), np.isnan(known)
-    std = constant_std(fitted.model)[free]
+    of_both, free = residuals_of(windows, fitted_model.model, width_m, fitted_model.wheels), np.isnan(known)
+    std = constant_std(fitted_model.model)[free]
 
     def whole(values: Floats) -> Floats:
         constants = known.copy()
@@ -446,8 +448,8 @@ def _fit_constants(
         return constants
 
     def evaluate(values: Floats) -> tuple[Floats, Floats]:
-        residuals, by = of_both(fitted.parameters, whole(values))
-        return residuals, by[:, len(fitted.parameters) :][:, free]
+        residuals, by = of_both(fitted_model.parameters, whole(values))
+        return residuals, by[:, len(fitted_model.parameters) :][:, free]
 
     zero, kind = np.zeros(len(std)), np.repeat(RESIDUAL_KINDS, len(windows.begin))
     fit = robust_least_squares(evaluate, zero, zero, std, kind=kind, overlap=overlap)

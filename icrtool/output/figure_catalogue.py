@@ -176,21 +176,21 @@ def drive_charts(position_word: str) -> tuple[Chart, ...]:
 
 
 def figures_of(
-    kind: Subject, subject: object, figures: FigureSet = "default", watch: Watch = unwatched
+    subject_type: Subject, subject: object, figures: FigureSet = "default", watch: Watch = unwatched
 ) -> Iterator[tuple[str, Figure]]:
     """Draw each figure for which a subject has numbers; yield it with the name of its file.
 
     `watch` is called with the name of each picture before it is drawn.
     """
     for name, entry in FIGURES.items():
-        if entry.subject == kind and (figures == "all" or not entry.further):
+        if entry.subject == subject_type and (figures == "all" or not entry.further):
             for part, arguments in entry.parts(subject).items():
                 watch(f"picture {name}{part}")
                 yield f"{name}{part}", entry.draw(subject, *arguments)
 
 
 def draw_figures(
-    kind: Subject, subject: object, directory: Path, formats: tuple[str, ...], figures: FigureSet = "default",
+    subject_type: Subject, subject: object, directory: Path, formats: tuple[str, ...], figures: FigureSet = "default",
     watch: Watch = unwatched,
 ) -> None:  # fmt: skip
     """Write the figures of a run or a report into a directory.
@@ -209,7 +209,7 @@ def draw_figures(
     directory.mkdir(exist_ok=True)
     from icrtool.output.figures.style import save_figure
 
-    for name, figure in figures_of(kind, subject, figures, watch):
+    for name, figure in figures_of(subject_type, subject, figures, watch):
         save_figure(figure, directory / name, formats)
 
 

@@ -130,9 +130,10 @@ def driven_text(drive: DriveDocument) -> str:
     return f"{distance_text(drive.distance_m)} in {duration_text(drive.duration_s)}"
 
 
-def model_text(fitted: FittedModel) -> str:
+def model_text(fitted_model: FittedModel) -> str:
     """Return a fitted model as ``three ICRs (3 parameters, model icr)``."""
-    return f"{fitted.model.label} ({counted(len(fitted.parameters), 'parameter')}, model {fitted.model.name})"
+    model, count = fitted_model.model, len(fitted_model.parameters)
+    return f"{model.label} ({counted(count, 'parameter')}, model {model.name})"
 
 
 def controller_error_text(errors: ControllerErrors | None) -> str:

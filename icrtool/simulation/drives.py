@@ -291,14 +291,14 @@ def drive_plan(plan: DrivePlan, tail_s: float, rng: np.random.Generator | None =
     if plan.motor_lag_s > 0:
         v_left, v_right = follow(left, t, plan.motor_lag_s), follow(right, t, plan.motor_lag_s)
     icrs = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)], np.float64)
-    which = np.searchsorted(edges, t, side="right").astype(np.int64)
+    icr_row = np.searchsorted(edges, t, side="right").astype(np.int64)
     step = np.diff(t)
     travel_left, travel_right = (np.concatenate([[0.0], np.cumsum(speed[:-1] * step)]) for speed in (v_left, v_right))
     start = np.array([0.0, 0.0, plan.start_heading_rad])
-    pose = drive(t, v_left, v_right, icrs, which, start)
+    pose = drive(t, v_left, v_right, icrs, icr_row, start)
     return IcrTruth(
         t_s=t, command_left_mps=left, command_right_mps=right, v_left_mps=v_left, v_right_mps=v_right,
-        travel_left_m=travel_left, travel_right_m=travel_right, pose=pose, icrs_m=icrs, which=which,
+        travel_left_m=travel_left, travel_right_m=travel_right, pose=pose, icrs_m=icrs, icr_row=icr_row,
     )  # fmt: skip
 
 

@@ -55,25 +55,25 @@ class IcrTruth(Truth):
 
     Attributes
     ----------
-    icrs_m : (c, 3); which : int64 (n,), the row of `icrs_m` that holds over [k, k+1)
+    icrs_m : (c, 3); icr_row : int64 (n,), the row of `icrs_m` that holds over [k, k+1)
     """
 
     icrs_m: Floats
-    which: Ints
+    icr_row: Ints
 
     def poses(self, times: Floats) -> Floats:
         """Return the pose (m, 3) at times (m,) [s], on the arcs between the rows."""
-        return poses_at(times, self.t_s, self.v_left_mps, self.v_right_mps, self.icrs_m, self.which, self.pose)
+        return poses_at(times, self.t_s, self.v_left_mps, self.v_right_mps, self.icrs_m, self.icr_row, self.pose)
 
     def turn_rates(self, times: Floats) -> Floats:
         """Return the turn rate (m,) [rad/s], clockwise positive, at times (m,) [s]."""
         row = self.rows(times)
-        right, left, _ = self.icrs_m[self.which[row]].T
+        right, left, _ = self.icrs_m[self.icr_row[row]].T
         return np.asarray((self.v_left_mps[row] - self.v_right_mps[row]) / (right - left))
 
     def icrs(self, times: Floats) -> Floats:
         """Return y_icr_right, y_icr_left, x_icr (m, 3) [m] at times (m,) [s]."""
-        return self.icrs_m[self.which[self.rows(times)]]
+        return self.icrs_m[self.icr_row[self.rows(times)]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -242,8 +242,8 @@ def format_twist(calibration: Calibration) -> str:
 
     `v_x`, `v_y` and `yaw_rate` are each the sum of the products of value and formula.
     """
-    fitted = calibration.fitted
-    free = [TERMS[name] for name in fitted.model.terms]
+    fitted_model = calibration.fitted
+    free = [TERMS[name] for name in fitted_model.model.terms]
     signs = np.array([sign_in_rep103(term) for term in free])
     fixed = [term for term in TERMS.values() if term.nominal and term not in free]
     geometry, stds = calibration.geometry, calibration.geometry_std
@@ -256,19 +256,19 @@ def format_twist(calibration: Calibration) -> str:
         "frame": "REP-103: x forward, y left, yaw counter-clockwise",
         "inputs": "v_left, v_right [m/s]: wheel speeds at the configured radius, forward positive",
         "outputs": "v_x, v_y [m/s], yaw_rate [rad/s]",
-        "model": fitted.model.name,
+        "model": fitted_model.model.name,
         "symbols": SYMBOLS,
         "track_width_m": calibration.width_m,
         "terms": [
             {"name": term.name, "output": AXES[term.axis], "formula": term.formula, "value": value, "std": std}
             for term, value, std in [
                 *((term, sign_in_rep103(term) * term.nominal, 0.0) for term in fixed),
-                *zip(free, (signs * fitted.parameters).tolist(), fitted.std.tolist(), strict=True),
+                *zip(free, (signs * fitted_model.parameters).tolist(), fitted_model.std.tolist(), strict=True),
             ]
         ],
         "covariance": {
-            "of": list(fitted.model.terms),
-            "matrix": (np.outer(signs, signs) * fitted.covariance).tolist(),
+            "of": list(fitted_model.model.terms),
+            "matrix": (np.outer(signs, signs) * fitted_model.covariance).tolist(),
         },
         "icrs": {
             "y_icr_right_m": -geometry["y_icr_right_m"], "y_icr_left_m": -geometry["y_icr_left_m"],

@@ -147,8 +147,8 @@ def _typestore() -> Typestore:
 def _transforms(paths: Sequence[ExportPath], rows: Ints, store: Typestore) -> write_log.TopicPlan:
     """Return topic ``/tf``: one message for each state, with the pose of each path."""
     stamps = paths[0].stamp_ns[rows]
-    kind = "geometry_msgs/msg/TransformStamped"
-    fixed: dict[str, object] = {"transforms": [write_log.blank_message(store, kind) for _ in paths]}
+    message_type = "geometry_msgs/msg/TransformStamped"
+    fixed: dict[str, object] = {"transforms": [write_log.blank_message(store, message_type) for _ in paths]}
     columns: dict[str, NDArray[Any]] = {}
     for number, path in enumerate(paths):
         place, (z, w) = f"transforms.{number}", path.quaternion
@@ -235,12 +235,12 @@ def _fixes(run: Run, rows: Ints, globe: Globe) -> Iterator[write_log.TopicPlan]:
 
 
 def _plan(
-    topic: str, kind: str, stamp_ns: Ints, frame: str, columns: dict[str, NDArray[Any]],
+    topic: str, message_type: str, stamp_ns: Ints, frame: str, columns: dict[str, NDArray[Any]],
     fixed: Mapping[str, object] = MappingProxyType({}),
 ) -> write_log.TopicPlan:  # fmt: skip
     """Return a topic whose messages begin with a header."""
     return write_log.TopicPlan(
-        topic, kind, stamp_ns, {"header.frame_id": frame, **fixed}, write_log.header_stamps(stamp_ns) | columns
+        topic, message_type, stamp_ns, {"header.frame_id": frame, **fixed}, write_log.header_stamps(stamp_ns) | columns
     )
 
 

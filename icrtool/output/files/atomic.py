@@ -87,13 +87,13 @@ def place_errors(place: Place) -> Iterator[None]:
         raise OutputError(path_of(place), "cannot be written", err.strerror or str(err)) from err
 
 
-def check_place(file: Place, ours: MayReplace | None = None) -> None:
+def check_place(file: Place, may_replace: MayReplace | None = None) -> None:
     """Refuse a place where a file cannot be put, before any work is done for it.
 
     Parameters
     ----------
     file : the place of the file
-    ours : as in `atomic_file`
+    may_replace : as in `atomic_file`
 
     Raises
     ------
@@ -102,11 +102,11 @@ def check_place(file: Place, ours: MayReplace | None = None) -> None:
         device, a pipe or a file that icrtool did not write is in this place.
     """
     with place_errors(file):
-        if not _target_of(file, ours).parent.is_dir():
+        if not _target_of(file, may_replace).parent.is_dir():
             raise OutputError(path_of(file), "its directory does not exist", "make it first, or name another file")
 
 
-def _target_of(file: Place, ours: MayReplace | None) -> Path:
+def _target_of(file: Place, may_replace: MayReplace | None) -> Path:
     """Return the path of a file without links; parameters and errors as in `check_place`."""
     path = path_of(file)
     if isinstance(file, Below):
@@ -127,20 +127,20 @@ def _target_of(file: Place, ours: MayReplace | None) -> Path:
         is_log = container_of(stream) is not None and EXPORTED_MCAP not in first[:64]
     if is_log or first.startswith(PACKED_BEGINNINGS):
         raise OutputError(path, "a log is there", "it is left alone; name another file")
-    if ours is not None and first and not ours(first):
+    if may_replace is not None and first and not may_replace(first):
         raise OutputError(path, "a file that icrtool did not write is there", "it is left alone; name another place")
     return place
 
 
 @contextmanager
-def atomic_file(file: Place, ours: MayReplace | None = None) -> Iterator[Path]:
+def atomic_file(file: Place, may_replace: MayReplace | None = None) -> Iterator[Path]:
     """Yield a hidden path to write a file to; when the block ends without error, the file is renamed to its place.
 
     Parameters
     ----------
     file : place of the file; a log is never replaced. If the place is below a folder, a link there is replaced; if the
         user named the path, the link is kept and its target is replaced
-    ours : states which files may be replaced; default: any file that is not a log
+    may_replace : states which files may be replaced; default: any file that is not a log
 
     Yields
     ------
@@ -153,18 +153,18 @@ def atomic_file(file: Place, ours: MayReplace | None = None) -> Iterator[Path]:
         `check_place` refuses the place, or the block raised an OSError (disk full, no permission). The old file is then
         unchanged.
     """
-    with place_errors(file), partial_at(_target_of(file, ours), Path.touch) as partial:
+    with place_errors(file), partial_at(_target_of(file, may_replace), Path.touch) as partial:
         yield partial
         sync(partial)
-        put_in_place(partial, _target_of(file, ours))
+        put_in_place(partial, _target_of(file, may_replace))
 
 
-def write_file(file: Place, content: str | bytes, ours: MayReplace | None = None) -> None:
+def write_file(file: Place, content: str | bytes, may_replace: MayReplace | None = None) -> None:
     """Write a file, whole or not at all.
 
     Parameters
     ----------
-    file, ours : as in `atomic_file`
+    file, may_replace : as in `atomic_file`
     content : bytes, or a text, which is written in UTF-8; characters that UTF-8 cannot hold become escapes
 
     Raises
@@ -172,7 +172,7 @@ def write_file(file: Place, content: str | bytes, ours: MayReplace | None = None
     OutputError
         `check_place` refuses the place, or the file cannot be written.
     """
-    with atomic_file(file, ours) as partial:
+    with atomic_file(file, may_replace) as partial:
         partial.write_bytes(content.encode("utf-8", errors="backslashreplace") if isinstance(content, str) else content)
 
 

@@ -207,7 +207,9 @@ def _models_data(
     joined : number of wheel samples from one step to the next
     origin : north and east of the origin of the map [m]
     """
-    recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(run.track_width_m)))
+    recording = cache(
+        lambda turn_sensor: turning_recording_of(run, turn_sensor, width_m=width_or_usual_m(run.track_width_m))
+    )
     paths = {
         **dict(_odometry(run, joined, origin)),
         **dict(_held_out(recording, report, steps)),
@@ -253,20 +255,20 @@ def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument,
     ladder = report.ladder
     if ladder.fits is UNSET:
         return
-    kind = ladder.heading or ""
-    recording = recording_of(kind)
+    turn_sensor = ladder.heading or ""
+    recording = recording_of(turn_sensor)
     windows = cache(partial(cut_windows, recording))
     wheels = {name: _fitted(name, ladder.fits) for name in (FIVE, RECOMMENDED)}
     for model, base in ((RECOMMENDED, RECOMMENDED), (CONTROLLER, FIVE)):
         fits = {model: wheels[base]}
         if recording.track.gyro is not None:
-            fits[f"{model}_{kind}"] = replace(_fitted(f"{base}_gyro", ladder.fits), wheels=wheels[base])
+            fits[f"{model}_{turn_sensor}"] = replace(_fitted(f"{base}_gyro", ladder.fits), wheels=wheels[base])
         for name, fit in fits.items():
             # A drive that is too short to find the delay of the wheels has no path.
             with suppress(DataError):
                 constants = own_constants(windows(), fit, recording.width_m)
-                fitted = controller_model(fit, recording.lever, recording.width_m) if model == CONTROLLER else fit
-                yield name, predicted_path(recording, fitted, constants)(recording.track.t[rows])
+                fitted_model = controller_model(fit, recording.lever, recording.width_m) if model == CONTROLLER else fit
+                yield name, predicted_path(recording, fitted_model, constants)(recording.track.t[rows])
 
 
 def _fitted(name: str, fits: Mapping[str, FitDocument]) -> FittedModel:

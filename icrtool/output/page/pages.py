@@ -96,7 +96,7 @@ def write_page(
     pictures = pictures_of_run(plots if plots is not None else run.directory)
     page = run_page(run, report.document, pictures, coordinates=coordinates)
     file = Path(path) if isinstance(path, str) else path
-    write_file(file, page, ours=is_page if isinstance(file, Below) else None)
+    write_file(file, page, may_replace=is_page if isinstance(file, Below) else None)
 
 
 def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture], *, coordinates: bool = True) -> str:

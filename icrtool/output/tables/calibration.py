@@ -337,7 +337,7 @@ def forecast_blocks(
         k = int(metres) - 1
         errors = [f"{column[k]:.2f}" for _, along in kinds for column in (along.expected_m, along.p95_m)]
         rows.append((f"{metres:g}", *errors, f"{forecast.heading_std_deg[k]:.1f}"))
-    head = [f"{name}{kind} [m]" for kind, _ in kinds for name in ("expected", "95 %")]
+    head = [f"{name}{suffix} [m]" for suffix, _ in kinds for name in ("expected", "95 %")]
     blocks: list[Block] = [
         f"{distance_text(total)} without GNSS from the start, wheels alone; {model}",
         "",
@@ -345,8 +345,8 @@ def forecast_blocks(
         "",
     ]
     for budget in budgets_m:
-        far = [(kind, distance_within(along, budget)) for kind, along in kinds]
-        reached = [f"{'all of it' if metres >= total else f'{metres:.1f} m'}{kind}" for kind, metres in far]
+        far = [(suffix, distance_within(along, budget)) for suffix, along in kinds]
+        reached = [f"{'all of it' if metres >= total else f'{metres:.1f} m'}{suffix}" for suffix, metres in far]
         blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
     if total > (longest := measured_to_m(calibration)):
         blocks.append(f"errors were measured up to {longest:g} m; errors beyond are extrapolated")

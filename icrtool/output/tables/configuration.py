@@ -27,9 +27,9 @@ def format_configuration(config: Config) -> str:
     """
     texts, document, default = key_texts(), config.effective(), Config().effective()
     parts = [CONFIGURATION_HEAD]
-    for section, kind in SECTIONS.items():
+    for section, section_type in SECTIONS.items():
         parts.append(f"\n[{section}]\n")
-        for key in (field.name for field in fields(kind)):
+        for key in (field.name for field in fields(section_type)):
             about, value = texts[section][key], document[section][key]
             parts += [
                 f"# {line}\n" for line in textwrap.wrap(about["text"], CONFIGURATION_WIDTH, break_long_words=False)

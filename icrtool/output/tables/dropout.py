@@ -10,7 +10,7 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from icrtool.calibration.held_sensors import SENSORS_CONTRADICT
-from icrtool.calibration.record import Calibration, fitted_model, stored_calibration
+from icrtool.calibration.record import Calibration, model_in_document, stored_calibration
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
@@ -345,7 +345,7 @@ def model_section(report: DropoutDocument) -> Section:
     parameters: list[Block] = []
     if (recommended := report.recommended) is not None:
         parameters = [
-            parameter_table(fitted_model(recommended.model, recommended)),
+            parameter_table(model_in_document(recommended.model, recommended)),
             *(finding.sentence for finding in recommended.notes),
         ]
     notes = [finding.sentence for finding in report.ladder.notes or ()]
@@ -357,12 +357,12 @@ WITH_GYRO = "with gyro: "
 """Prefix of the names of parameters of a model with a gyro."""
 
 
-def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:
+def parameter_table(fitted_model: FittedModel, gyro: FittedModel | None = None) -> Table:
     """Return the parameters of a model with one standard deviation each, and the parameters of its form with a gyro."""
     rows = [
-        (name if model is fitted else f"{WITH_GYRO}{name}", plus_minus(value, std, 4),
+        (name if model is fitted_model else f"{WITH_GYRO}{name}", plus_minus(value, std, 4),
          "not shown" if name in model.not_shown else "shown", TERMS[name].meaning)
-        for model in (fitted, gyro) if model is not None
+        for model in (fitted_model, gyro) if model is not None
         for name, value, std in zip(model.model.terms, model.parameters, model.std, strict=True)
     ]  # fmt: skip
     return Table("lrll", rows, ("term", "value ± σ", "by this drive", "meaning"))

@@ -76,9 +76,9 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     sentences = [*_source_lines(report), *_count_lines(report, summary)]
     rests = [Table("llr", list(_other_rows(report, horizons)), head), *sentences, *_learned_blocks(report, horizons)]
     for split in report.by_turning:
-        kind = "straight" if split.straight else "turning"
+        starts_word = "straight" if split.straight else "turning"
         errors = ", ".join(f"{name} {error_text(error)}" for name, error in split.expected_m.items())
-        rests.append(f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)")
+        rests.append(f"{starts_word} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)")
     caption = (
         f"{FIGURES['summary'].caption} The budget is the dashed red line. Band: 95 % interval of the number itself, "
         "of the best row by wheels, or of the row whose name is pointed at."

@@ -169,10 +169,10 @@ def warnings_line(notes: Sequence[Note]) -> str:
     return f"{counted(count, 'warning')} (-v): {first.finding}" if first is not None else ""
 
 
-def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None) -> list[Block]:
+def number_blocks(summary: RunDocument, own_numbers: ControllerNumbers | None = None) -> list[Block]:
     """Return the numbers for a controller, of the run or `fitted`, and the ICRs from which they are computed."""
     width_m, icrs = summary.config.robot.track_width_m, [summary.icr_of_drive(column) for column in ICR_COLUMNS]
-    numbers = fitted or summary.controller
+    numbers = own_numbers or summary.controller
     if width_m is not None and numbers is not None:
         return blocks_of_numbers(numbers, width_m, icrs)
     why = "no multiplier and no no-slip model: robot.track_width_m is not known (--robot, --set)"

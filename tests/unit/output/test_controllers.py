@@ -10,7 +10,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from icrtool.calibration.pooled import calibrate
-from icrtool.calibration.record import Calibration, factor_to_old, fitted_model, parameter_documents, unfit_reasons
+from icrtool.calibration.record import Calibration, factor_to_old, model_in_document, parameter_documents, unfit_reasons
 from icrtool.errors import ConfigError, DataError
 from icrtool.motion.models import MODELS, FittedModel, Lever, controller_model, wheel_motion
 from icrtool.output.exports.controllers import CONTROLLER_TARGETS, format_export
@@ -142,7 +142,7 @@ def test_a_controller_drives_as_its_model_was_tested(calibration: Calibration) -
     left, right = numbers.left_radius * v_left, numbers.right_radius * v_right
     expected = [(left + right) / 2, 0.0, (left - right) / (numbers.multiplier * b)]
     motion = wheel_motion(np.array([v_left]), np.array([v_right]), b)
-    tested = controller_model(fitted_model("five", calibration.models["five"]), Lever(ahead=True, aside=True), b)
+    tested = controller_model(model_in_document("five", calibration.models["five"]), Lever(ahead=True, aside=True), b)
     assert tested.twist(motion)[:, 0] == pytest.approx(expected)
 
 

@@ -92,8 +92,8 @@ def test_icrs_change_at_their_time_to_the_nanosecond() -> None:
     truth = drive_plan(DrivePlan(changes=((change, (0.6, -0.6, 0.0)),)), 0.0)
     row = int(np.searchsorted(truth.t_s, change))
     assert truth.t_s[row] == change
-    assert truth.which[row - 1] == 0
-    assert truth.which[row] == 1
+    assert truth.icr_row[row - 1] == 0
+    assert truth.icr_row[row] == 1
 
 
 def test_given_track_speeds_are_driven_as_they_are() -> None:
