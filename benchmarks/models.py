@@ -131,7 +131,7 @@ def predict(name: str, found: PooledFit, fold: Fold, recording: Recording) -> Pr
     """Return what a row predicts without a fold."""
     if name == NO_SLIP:
         return found.fitted, NO_CONSTANTS
-    without = found.without(fold)
+    without = found.fit_without(fold)
     if name != CONTROLLER or without is None:
         return without
     return controller_model(without[0], recording.lever, recording.width_m), without[1]

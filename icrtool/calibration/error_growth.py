@@ -66,7 +66,7 @@ class Spread(NamedTuple):
     xy: Floats
     yy: Floats
 
-    def combined(self, variances: Floats) -> Spread:
+    def combined_moments(self, variances: Floats) -> Spread:
         """Return the moments (w, 1) of all sources together, for variances (c,) of the sources."""
         return Spread(*((moments @ variances)[:, None] for moments in self))
 
@@ -129,32 +129,36 @@ def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread
     middle_m, middle_rad = (length[1:] + length[:-1]) / 2, (theta[1:] + theta[:-1]) / 2
     middle = (place[1:] + place[:-1]) / 2
 
-    def between(values: Values) -> Values:
+    def sum_between_knots(values: Values) -> Values:
         """Return the sum of values between the knots of each window."""
         sums = np.concatenate([np.zeros(1, values.dtype), np.cumsum(values)])
         difference: Values = sums[e] - sums[s]
         return difference
 
     back, went, driven = np.exp(-1j * theta[s]), place[e] - place[s], length[e] - length[s]
-    by_rate = 1j * back * (between(step * middle_m) - length[s] * went)
-    by_turn = 1j * back * (between(step * middle_rad) - theta[s] * went)
+    by_rate = 1j * back * (sum_between_knots(step * middle_m) - length[s] * went)
+    by_turn = 1j * back * (sum_between_knots(step * middle_rad) - theta[s] * went)
     constant = [
         (0.0 * driven, 1j * back * went),
         (driven, by_rate),
         (theta[e] - theta[s], by_turn),
         (0.0 * driven, back * went),
     ]
-    driven_m, first = np.abs(step), between(np.abs(step) * middle)
-    zero = between(driven_m)
+    driven_m, first = np.abs(step), sum_between_knots(np.abs(step) * middle)
+    zero = sum_between_knots(driven_m)
     # The sum of q (S_e - S_u)(S_e - S_u)^T along the path is computed as squared length and as square of a complex
     # number.
     size = (
-        zero * np.abs(place[e]) ** 2 - 2.0 * (np.conj(place[e]) * first).real + between(driven_m * np.abs(middle) ** 2)
+        zero * np.abs(place[e]) ** 2
+        - 2.0 * (np.conj(place[e]) * first).real
+        + sum_between_knots(driven_m * np.abs(middle) ** 2)
     )
-    square = (zero * place[e] ** 2 - 2.0 * place[e] * first + between(driven_m * middle**2)) * (1j * back) ** 2
+    square = (zero * place[e] ** 2 - 2.0 * place[e] * first + sum_between_knots(driven_m * middle**2)) * (
+        1j * back
+    ) ** 2
     wander = _from_squares(driven, size, square)
     along = np.divide(step**2, driven_m, out=np.zeros(len(step), np.complex128), where=driven_m > 0.0)
-    speed = _from_squares(0.0 * driven, zero, between(along) * back**2)
+    speed = _from_squares(0.0 * driven, zero, sum_between_knots(along) * back**2)
     moments = [Spread(h**2, p.real**2, p.real * p.imag, p.imag**2) for h, p in constant]
     ones, none = np.ones(len(s)), np.zeros(len(s))
     reference = [Spread(ones, none, none, none), Spread(none, ones, none, ones)]
@@ -368,5 +372,5 @@ def forecast_errors(calibration: Calibration, windows: Windows, *, with_gyro: bo
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
     growth = path_errors(windows, fitted_model, calibration.width_m)
-    spread = growth.of_sources.combined(np.array(astuple(sources)[:SOURCES])).plus(growth.of_parameters)
+    spread = growth.of_sources.combined_moments(np.array(astuple(sources)[:SOURCES])).plus(growth.of_parameters)
     return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius_of_share(spread, 0.95)

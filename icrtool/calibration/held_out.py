@@ -181,14 +181,14 @@ class HeldOut:
         """Return the row of this name."""
         return next(score for score in self.scores if score.name == name)
 
-    def without(self, name: str, fold: Fold) -> Prediction | None:
+    def fit_without(self, name: str, fold: Fold) -> Prediction | None:
         """Return the model and constants of a row, fitted without a fold; None if too little data are left."""
         if name == NO_SLIP:
             return self.fits[NO_SLIP].fitted, NO_CONSTANTS
         base = name.removesuffix(GYRO_SUFFIX)
         if base != CONTROLLER:
-            return self.fits[name].without(fold)
-        if (solution := self.fits[name.replace(CONTROLLER, FIVE)].without(fold)) is None:
+            return self.fits[name].fit_without(fold)
+        if (solution := self.fits[name.replace(CONTROLLER, FIVE)].fit_without(fold)) is None:
             return None
         recording = self.recordings[fold.recording]
         return controller_model(solution[0], recording.lever, recording.width_m), solution[1]
@@ -196,7 +196,7 @@ class HeldOut:
     def errors(self, name: str, i: int, trials: Trials) -> TrialErrors:
         """Return the errors (k, h) of a row in trials of recording i, each predicted without the fold it touches."""
         steps = self.fits[RECOMMENDED].pool.windows[i].track
-        return errors_without(self.recordings[i], trials, self.folds, i, partial(self.without, name), steps)
+        return errors_without(self.recordings[i], trials, self.folds, i, partial(self.fit_without, name), steps)
 
     def path(self, name: str, i: int, start: int, end: int) -> OpenLoopPath | None:
         """Return the path of a row between two states of recording i, predicted without the fold that it touches.
@@ -206,7 +206,7 @@ class HeldOut:
         recording = self.recordings[i]
         ends = (recording.track.distance[row : row + 1] for row in (start, end))
         ((fold, _),) = left_out(self.folds, i, *ends)
-        if (prediction := self.without(name, fold)) is None:
+        if (prediction := self.fit_without(name, fold)) is None:
             return None
         return path_between(recording, prediction, self.fits[RECOMMENDED].pool.windows[i].track, start, end)
 
@@ -351,7 +351,7 @@ def _left_out_windows(
         chosen = np.flatnonzero(np.isin(windows.length_m, lengths_m))
         start_m, end_m = (windows.track.distance[rows[chosen]] for rows in (windows.begin, windows.end))
         for fold, in_fold in left_out(table.folds, i, start_m, end_m):
-            if (predicted := table.without(name, fold)) is not None:
+            if (predicted := table.fit_without(name, fold)) is not None:
                 rows = chosen[in_fold]
                 begin, end = windows.begin[rows], windows.end[rows]
                 steps = windows.track.around(*windows.track.place_t[[begin.min(), end.max()]].tolist())
@@ -392,7 +392,7 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     )
     turned, missed = (np.concatenate([log[k] for log in of_logs])[used] for k in (2, 3))
     variances = error_growth.fit_variances(length, sources, stated, turned, missed)
-    spread, far = sources.combined(variances).plus(stated), length >= SCALED_FROM_M
+    spread, far = sources.combined_moments(variances).plus(stated), length >= SCALED_FROM_M
     error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
     level = min(95.0 * (1.0 + 1.0 / count), 100.0)
     share = np.percentile(error / np.maximum(error_growth.radius_of_share(spread, 0.95)[far], 1e-9), level)

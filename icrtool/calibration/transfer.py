@@ -87,7 +87,7 @@ def compare_calibrations(
     for (row, result), (column, column_result) in product(results.items(), results.items()):
         held_out = applied = tested[column, column]
         if row != column:
-            # Another track width or wheel radius: another robot.
+            # Another track width or wheel radius means another robot.
             ours, theirs = result.calibration, column_result.calibration
             same_width = math.isclose(ours.width_m, theirs.width_m, rel_tol=1e-3)
             applied = held_out._replace(errors=np.full_like(held_out.errors, np.nan))

@@ -196,7 +196,9 @@ def _end(number: int, frame: FrameType | None = None) -> None:
     if (processes := sys.modules.get("icrtool.fleet.processes")) is not None:
         processes.end_for_good()
     remove_unfinished()
-    with suppress(OSError, ValueError, RuntimeError):  # RuntimeError: the stream is being written at this moment
+    with suppress(
+        OSError, ValueError, RuntimeError
+    ):  # A RuntimeError means that the stream is being written at this moment.
         sys.stdout.flush()
     with suppress(OSError):
         if number == signal.SIGINT:

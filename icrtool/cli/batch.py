@@ -227,7 +227,7 @@ def line_of(row: FleetLog) -> str:
     if row.distance_m is not None:
         parts.append(f"{row.distance_m:.0f} m")
     if not row.usable:
-        # the first cause without its numbers; fleet.csv has the whole text
+        # The line has the first cause without its numbers; fleet.csv has the whole text.
         cause = next((finding.finding for finding in row.notes if notes.is_grave(finding)), "")
         return "  ".join([*parts, f"do not use: {escaped(cause)}"])
     if row.multiplier is not None:

@@ -111,7 +111,7 @@ def dropout_report_command(
     for number, source in enumerate(sources):
         if number:
             printer.text("")
-        with inputs.each(source) as document:
+        with inputs.document_of(source) as document:
             result = report_one(source, places.get(source), config, report, files, other_results, printer)
             reports[str(source)] = result
             if printer.as_json:

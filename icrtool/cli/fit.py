@@ -81,7 +81,7 @@ def fit_command(
     logs = logs_of(logs, printer)
     inputs, all_usable = Inputs("log"), True
     for log, run_place in zip(logs, run_directories(logs, place), strict=True):
-        with inputs.each(log) as document:
+        with inputs.document_of(log) as document:
             with fitted_log(log, run_place, config, request, files, printer, warm_start, warns=False) as (run, _):
                 pass
             all_usable = all_usable and run.usable
@@ -152,7 +152,7 @@ def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSo
     config, options_given = settings.load(), options.options_to_repeat(settings, request)
     inputs = Inputs("log")
     for log in logs_of(logs, printer):
-        with inputs.each(log) as document:
+        with inputs.document_of(log) as document:
             _examine(log, config, request, options_given, document, printer)
     printer.json("info", {"logs": inputs.documents})
     inputs.exit_if_failed("logs")

@@ -210,7 +210,7 @@ class Inputs:
         self.errors: dict[str, errors.IcrToolError] = {}
 
     @contextmanager
-    def each(self, source: Path) -> Iterator[dict[str, Any]]:
+    def document_of(self, source: Path) -> Iterator[dict[str, Any]]:
         """Yield the document of one input to the block, and print an error that the block raises."""
         document: dict[str, Any] = {self._key: escaped(str(source)), "status": "done"}
         self.documents.append(document)

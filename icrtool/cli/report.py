@@ -88,7 +88,7 @@ def report_command(
     places = dict(zip(logs, run_directories(logs, ResultPlace(into=into)), strict=True))
     inputs = Inputs("source")
     for source in sources:
-        with inputs.each(source):
+        with inputs.document_of(source):
             result = source
             files = requests.ResultFiles(overwrite=overwrite, page=output is None and not no_coordinates)
             if source in places:

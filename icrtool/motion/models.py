@@ -129,14 +129,14 @@ class MotionModel:
         """Prior standard deviation of each term (k,)."""
         return np.array(self.stds or [TERMS[name].std for name in self.terms])
 
-    def widened(self) -> MotionModel | None:
+    def with_wide_priors(self) -> MotionModel | None:
         """Return the model with wide priors of the terms that have a wide prior; None without such terms."""
         if self.stds or not any(TERMS[name].wide for name in self.terms):
             return None
         return replace(self, stds=tuple(TERMS[name].wide or TERMS[name].std for name in self.terms))
 
-    def as_shown(self, widened: FittedModel) -> MotionModel:
-        """Return the model with the priors that follow from a fit of the `widened` model.
+    def with_shown_priors(self, widened: FittedModel) -> MotionModel:
+        """Return the model with the priors that follow from a fit of the model of `with_wide_priors`.
 
         Notes
         -----

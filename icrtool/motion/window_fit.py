@@ -269,7 +269,7 @@ class PooledFit(FittedModel):
         first = len(self.parameters) + constant_count * recording
         return x[first : first + constant_count]
 
-    def without(self, fold: Fold) -> Prediction | None:
+    def fit_without(self, fold: Fold) -> Prediction | None:
         """Return the model fitted without a fold, and the constants of the fold's recording for this model.
 
         None if too few residuals are left. The constants of a whole recording are estimated in this recording; with
@@ -290,10 +290,10 @@ class PooledFit(FittedModel):
             covariance = self._covariance(np.linalg.inv(refit.curvature)[:k, :k])
             fitted_model = replace(refit.fitted, covariance=covariance)
             return fitted_model, own_constants(pool.windows[i], fitted_model, pool.widths_m[i])
-        of_wheels = None if self.wheels is None else self.wheels.without(fold)
+        of_wheels = None if self.wheels is None else self.wheels.fit_without(fold)
         wheels = None if of_wheels is None else of_wheels[0]
-        shown = None if self.wide is None else self.wide.without(fold)
-        model = self.model if shown is None else replace(self.model, stds=()).as_shown(shown[0])
+        shown = None if self.wide is None else self.wide.fit_without(fold)
+        model = self.model if shown is None else replace(self.model, stds=()).with_shown_priors(shown[0])
         if fold.whole:
             gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
             # The priors may be different without the recording.
@@ -313,7 +313,7 @@ class PooledFit(FittedModel):
         """Return a fit of the model to the other recordings."""
         if recording not in self._refits:
             wheels = None if self.wheels is None else self.wheels.refit_without(recording)
-            self._refits[recording] = self.pool.without(recording).fit(replace(self.model, stds=()), wheels)
+            self._refits[recording] = self.pool.without_recording(recording).fit(replace(self.model, stds=()), wheels)
         return self._refits[recording]
 
     def _reweighted(self, clear: Bools, model: MotionModel) -> tuple[Floats, Floats]:
@@ -493,7 +493,7 @@ class Pool:
         mean = np.concatenate([model.prior_mean, np.zeros(len(constants_std))])
         return mean, np.concatenate([model.prior_std, constants_std])
 
-    def without(self, recording: int) -> Pool:
+    def without_recording(self, recording: int) -> Pool:
         """Return the windows of the other recordings."""
         others = [i for i in range(len(self.windows)) if i != recording]
         return Pool([self.windows[i] for i in others], [self.widths_m[i] for i in others])
@@ -517,12 +517,12 @@ class Pool:
 
         Notes
         -----
-        The priors of some terms become wider if these windows show the terms (`MotionModel.as_shown`).
+        The priors of some terms become wider if these windows show the terms (`MotionModel.with_shown_priors`).
         """
-        widened, wide = model.widened(), None
-        if widened is not None:
-            wide = self.fit(widened, wheels)
-            model = model.as_shown(wide)
+        wide_model, wide = model.with_wide_priors(), None
+        if wide_model is not None:
+            wide = self.fit(wide_model, wheels)
+            model = model.with_shown_priors(wide)
         of_recordings = [
             residuals_of(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)
         ]

@@ -102,7 +102,7 @@ def xml_text(text: str) -> str:
     return _NOT_XML.sub("?", text)
 
 
-def signed(metres: float, digits: int = 3) -> str:
+def signed_text(metres: float, digits: int = 3) -> str:
     """Return a number with its sign, by default to the millimetre, with a typographic minus instead of a hyphen."""
     return f"{metres:+.{digits}f}".replace("-", "−") if round(metres, digits) else f"{0:.{digits}f}"
 

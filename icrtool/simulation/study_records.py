@@ -82,7 +82,7 @@ class Setting(NamedTuple):
 
 
 class Level(NamedTuple):
-    """A setting, and the results of its runs (runs, ...) by name; results with one number a run are CSV columns."""
+    """A setting, and the results of its runs (runs, ...) by name; those with one number for a run are CSV columns."""
 
     setting: Setting
     found: Mapping[str, Floats]
@@ -93,7 +93,7 @@ class Level(NamedTuple):
         return {"series": self.setting.series, **self.setting.names}
 
     def numbers(self) -> dict[str, Floats]:
-        """Return the numbers with one value a run (runs,), by name."""
+        """Return the numbers with one value for each run (runs,), by name."""
         return {name: values for name, values in self.found.items() if values.ndim == 1}
 
     def metrics(self) -> dict[str, dict[str, float]]:

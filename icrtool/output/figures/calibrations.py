@@ -16,7 +16,7 @@ from icrtool.output.figures.labels import Label, write_labels
 from icrtool.output.figures.sheet import Sheet, new_sheet, styled
 from icrtool.output.figures.trajectory import name_directions
 from icrtool.output.series import round_steps
-from icrtool.output.text_format import error_text, signed
+from icrtool.output.text_format import error_text, signed_text
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import ErrorsAt, GroupComparison
 from icrtool.records.text import counted
@@ -56,7 +56,7 @@ def forecast_figure(
     if reached is not None:
         answer = f"Within {budgets_m[0]:g} m (95 %) for {reached[0]:.1f} m, {answer}"
     by = "wheels alone" if gyro is None else "wheels alone, and with gyro"
-    # Of both errors of each forecast, budgets, and up to four more.
+    # The legend has both errors of each forecast, the budgets, and up to four more entries.
     entries = 2 * (1 if gyro is None else 2) + len(budgets_m) + 4
     keys_in = style.KEY_ROW_IN * max(-(-entries // FORECAST_KEY_COLUMNS) - 2, 0)
     height_in, margins_in = 4.5 + keys_in, (0.8, 0.25, 0.75, 1.05 + keys_in)
@@ -84,7 +84,7 @@ def forecast_figure(
     path.set_aspect("equal", adjustable="datalim")
     name_directions(path, document)
     sheet.legend(ncols=FORECAST_KEY_COLUMNS)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _draw_error_circles(axes: Axes, forecast: Forecast, last_m: float) -> None:
@@ -169,7 +169,7 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | No
     turn.set(xlabel="Heading change, clockwise [°]", ylabel="Median residual [°]")
     turn.set_title("residual by heading change\n(a slope: wrong multiplier)", loc="left", pad=5.0, fontsize=8.5)
     sheet.legend()
-    return sheet.finished()
+    return sheet.finish()
 
 
 LONGEST_GROUP_NAME = 12
@@ -225,7 +225,7 @@ def transfer(comparison: GroupComparison, *, ax: Axes | None = None) -> Figure |
     difference_axes.set_xlabel("Difference of the 95 % error [m]")
     difference_axes.set_title("Differences: right of 0 is a larger error", loc="left", pad=5.0)
     sheet.legend(columnspacing=2.4)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _group(name: str) -> str:
@@ -241,11 +241,11 @@ def _comparison_title(comparison: GroupComparison) -> str:
     pair, value_m, error = max(with_cost, key=lambda each: abs(each[1]))
     at_m = f"at {CHOICE_HORIZON_M:g} m"
     if error.p95_low_m is None or error.p95_high_m is None:
-        return f"{_group(pair.second)}: {signed(value_m, 2)} m against {_group(pair.first)} {at_m}, no interval"
-    interval = f"({signed(error.p95_low_m, 2)} to {signed(error.p95_high_m, 2)})"
+        return f"{_group(pair.second)}: {signed_text(value_m, 2)} m against {_group(pair.first)} {at_m}, no interval"
+    interval = f"({signed_text(error.p95_low_m, 2)} to {signed_text(error.p95_high_m, 2)})"
     if error.p95_low_m <= 0.0 <= error.p95_high_m:
-        return f"No difference shown {at_m}: {signed(value_m, 2)} m {interval}"
-    return f"{_group(pair.second)}: {signed(value_m, 2)} m against {_group(pair.first)} {at_m} {interval}"
+        return f"No difference shown {at_m}: {signed_text(value_m, 2)} m {interval}"
+    return f"{_group(pair.second)}: {signed_text(value_m, 2)} m against {_group(pair.first)} {at_m} {interval}"
 
 
 def _errors_of_groups(comparison: GroupComparison) -> list[Difference]:
@@ -354,7 +354,7 @@ def fleet_icrs(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
     spans = []
     for side in ("right", "left"):
         icrs_m = [point.icr[f"y_icr_{side}_m"] or 0.0 for point in points]
-        spans.append(f"y {side} {signed(min(icrs_m), 2)} to {signed(max(icrs_m), 2)} m")
+        spans.append(f"y {side} {signed_text(min(icrs_m), 2)} to {signed_text(max(icrs_m), 2)} m")
     title, subtitle = f"ICRs: {', '.join(spans)}", f"{fleet.title}: of each log, ±1σ"
     if len(points) > MOST_CALENDAR_ROWS:
         sheet = new_sheet(title, subtitle, ax, height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12)
@@ -379,7 +379,7 @@ def fleet_icrs(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
         right.tick_params(labelleft=False)
         left.set_ylim(len(ordered) - 0.4, -0.6)
     sheet.legend(ncols=4)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _key_of(robot: str) -> str:
@@ -451,4 +451,4 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
         style.write_near(axes, error_text(error), (last, row), (6.0, 0.0), **centred)
     style.logarithmic_errors(axes)
     sheet.legend(ncols=2)
-    return sheet.finished()
+    return sheet.finish()

@@ -148,7 +148,7 @@ def dropout_summary(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     _write_end(axes, report, first)
     _mark_reaches(axes, marked, pens, low, curves)
     sheet.legend(ncols=SUMMARY_KEY_COLUMNS)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _summary_title(report: DropoutReport, first: ModelResult) -> str:
@@ -223,7 +223,7 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | Non
             axes.axvline(budget, label=f"budget {budget:g} m", **style.BUDGET)
     panels[-1].set_xlabel("Error [m]")
     sheet.legend(columnspacing=3.0)
-    return sheet.finished()
+    return sheet.finish()
 
 
 @styled
@@ -252,7 +252,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float, *, ax: Axes | Non
         _draw_bins(axes, result, h, _pens(report)[result.name]["color"], end, result.name)
     panels[-1].set_xlabel("Error [m]")
     sheet.legend(columnspacing=3.0)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _pictured(report: DropoutReport) -> list[ModelResult]:

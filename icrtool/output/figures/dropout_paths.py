@@ -111,7 +111,7 @@ def dropout_examples(report: DropoutReport, *, ax: Axes | None = None) -> Figure
         axes.set_xlabel(f"{across} from start [m]")
         axes.set_ylabel(f"{up} from start [m]")
     sheet.legend()
-    return sheet.finished()
+    return sheet.finish()
 
 
 @styled
@@ -146,7 +146,7 @@ def dropout_worst(report: DropoutReport, *, ax: Axes | None = None) -> Figure | 
     for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
     sheet.legend()
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, east_m: Floats) -> None:
@@ -232,7 +232,7 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     write_labels(axes, labels, lines, crossing=True, marks=begins)
     name_directions(axes, report.run_document)
     sheet.legend()
-    return sheet.finished()
+    return sheet.finish()
 
 
 LEAST_VIEW = 0.25
@@ -350,7 +350,7 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
         write_labels(axes, labels, [(east, north)], crossing=True, fontweight="bold")
     name_directions(axes, report.run_document)
     sheet.legend()
-    return sheet.finished()
+    return sheet.finish()
 
 
 Content = TypeVar("Content", ExampleTrial, Outage, PathErrors)

@@ -21,7 +21,7 @@ from icrtool.output.series import (
     scale_end_m,
     scale_of,
 )
-from icrtool.output.text_format import error_text, fix_word, position_word, run_title, signed
+from icrtool.output.text_format import error_text, fix_word, position_word, run_title, signed_text
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import IcrColumn
 
@@ -80,7 +80,7 @@ def icr_estimates(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     """
     finals, stds = run.document.icr.final, run.document.icr.final_std
     ends = ", ".join(
-        f"{ICR_WORDS[column]} {signed(at)} m" for column in ICR_COLUMNS if (at := finals[column]) is not None
+        f"{ICR_WORDS[column]} {signed_text(at)} m" for column in ICR_COLUMNS if (at := finals[column]) is not None
     )
     unknown = ", ".join(ICR_WORDS[column] for column in ICR_COLUMNS if finals[column] is None)
     title = f"The ICRs end at {ends}{f'; not shown: {unknown}' if unknown else ''}"
@@ -106,14 +106,16 @@ def icr_estimates(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
         without = "known from the start" if run.began_with is not None else "does not converge"
         numbers = f"10–90 % in {settling[1] - settling[0]:.1f} s" if settling else without
         row[0].set_title(numbers, loc="left", pad=4.0)
-        numbers = f"final {signed(final)} ± {stds[column]:.3f} m" if final is not None else "not shown by this drive"
+        numbers = (
+            f"final {signed_text(final)} ± {stds[column]:.3f} m" if final is not None else "not shown by this drive"
+        )
         if final is not None and (of_drive := run.document.icr_of_drive(column)) is not None:
-            numbers += f", drive {signed(of_drive[0])} ± {of_drive[1]:.3f} m"
+            numbers += f", drive {signed_text(of_drive[0])} ± {of_drive[1]:.3f} m"
         row[-1].set_title(numbers, loc="right", pad=4.0)
     for axes, (begin, end) in zip(panels[-1], spans, strict=True):
         axes.set_xlabel(_time_axis(end - begin)[0])
     sheet.legend(ncols=4, columnspacing=1.4, handlelength=2.0)
-    return sheet.finished()
+    return sheet.finish()
 
 
 @styled
@@ -139,7 +141,7 @@ def icr_clusters(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
         _draw_histogram(axes, run, column, value, weight, span)
     panels[0].set_ylabel("Time [%]")
     sheet.legend(columnspacing=3.0)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _draw_estimate(
@@ -193,7 +195,7 @@ def _draw_estimate(
     low_end, high_end = axes.get_ylim()
     for row, edge, arrow in ((int(value.argmin()), low_end, "↓"), (int(value.argmax()), high_end, "↑")):
         if not low_end <= value[row] <= high_end:
-            text, va = f" {arrow} {signed(value[row])}", "top" if edge == high_end else "bottom"
+            text, va = f" {arrow} {signed_text(value[row])}", "top" if edge == high_end else "bottom"
             style.write_near(axes, text, (t[row] / unit, edge), va=va, fontsize=7.5, color=style.BAD_FIX_COLOR)
 
 
@@ -222,12 +224,12 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
     title = "not shown"
     if mean is not None:
         axes.axvline(mean, label="mean", **style.MEAN)
-        title = f"{signed(mean)} ± {std:.3f} m"
+        title = f"{signed_text(mean)} ± {std:.3f} m"
     if (track := run.track_width_m) is not None:
         place = SIDES[column] * track / 2
         if low <= place <= high:
             axes.axvline(place, **NO_SLIP_PLACE)
-        title += f"\nno slip: {signed(place)} m"
+        title += f"\nno slip: {signed_text(place)} m"
     axes.set_title(title, pad=4.0)
     axes.set_xlabel(f"ICR {ICR_WORDS[column]} [m]")
     axes.locator_params(axis="x", nbins=3, min_n_ticks=2)
@@ -273,7 +275,7 @@ def gnss_difference(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     _shade_outages(axes, run, unit, f"no usable {fix_word(run.document)}{', or RTK lost' if lost else ''}")
     axes.set(xlim=(0, max(duration_s / unit, 1e-3)), ylim=(0, top), xlabel=name, ylabel="Difference [m]")
     sheet.legend(ncols=3, columnspacing=1.6, handlelength=2.0)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:

@@ -142,7 +142,7 @@ class Sheet:
         for text in legend.get_texts():
             text.set_parse_math(False)
 
-    def finished(self) -> Figure | Axes:
+    def finish(self) -> Figure | Axes:
         """Return the caller's axes, or the figure with the names of its axes at fixed places."""
         if self.ax is not None:
             self._fit_to_dark(self.ax)

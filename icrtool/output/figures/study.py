@@ -17,7 +17,7 @@ from icrtool.output.figures import style
 from icrtool.output.figures.sheet import new_sheet, styled
 from icrtool.output.series import BLUE, GREEN, ORANGE, RED
 from icrtool.output.tables.study import finding_text, runs_text
-from icrtool.output.text_format import signed
+from icrtool.output.text_format import signed_text
 from icrtool.records.presets import PRESETS
 from icrtool.simulation.studies import shown_path
 from icrtool.simulation.study_records import Level, StudyResult, chi2_band, consistency_of
@@ -39,7 +39,7 @@ def study_title(result: StudyResult) -> str:
 def study_subtitle(result: StudyResult) -> str:
     """Return a study's name, with the robot's where it has one, the true ICRs, the path and the runs."""
     request, robot = result.request, result.request.config.robot.name
-    icrs = ", ".join(signed(icr, 2) for icr in request.plan.icrs_m)
+    icrs = ", ".join(signed_text(icr, 2) for icr in request.plan.icrs_m)
     return (
         f"{request.name}{f', {robot}' if robot else ''}: ICRs {icrs} m, {request.path.kind} path, "
         f"{request.path.speed_mps:g} m/s, {runs_text(request)}"
@@ -105,7 +105,7 @@ def study_figure(result: StudyResult, *, ax: Axes | None = None) -> Figure | Axe
             draw(panels[row][column], result, levels)
             panels[row][0].set_ylabel(label)
     sheet.legend(title=NOTES.get(result.request.name, NOTE), ncols=5)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _varied(result: StudyResult) -> str:

@@ -140,7 +140,7 @@ def trajectory(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     _write_times(axes, run, cell, drawn)
     name_directions(axes, run.document)
     sheet.legend(ncols=2, columnspacing=3.0)
-    return sheet.finished()
+    return sheet.finish()
 
 
 def _corners(path: States | OdometryPath) -> Corners:

@@ -117,7 +117,7 @@ def _target_of(file: Place, may_replace: MayReplace | None) -> Path:
     if place.is_dir():
         raise OutputError(path, "is a directory", "name a file")
     if place.is_symlink() or not place.exists():
-        return place  # the link itself is replaced, not its target
+        return place  # The link itself is replaced, not its target.
     if not place.is_file():
         raise OutputError(path, "is a device or pipe, which would be replaced", "name a file")
     from icrtool.logs.containers.open_log import container_of

@@ -302,7 +302,7 @@ def write_measurements(run: Run, path: Path) -> None:
     if sensors.attitude is not None:
         columns |= {f"attitude_{name}": getattr(sensors.attitude, name) for name in _names(HeadingSamples)}
     with path.open("xb") as file:
-        np.savez(file, **columns)  # type: ignore[arg-type]  # numpy's stub takes the columns for its own flag
+        np.savez(file, **columns)  # type: ignore[arg-type]  # The stub of numpy takes the columns for its own flag.
 
 
 def read_measurements(

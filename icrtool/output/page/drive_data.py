@@ -140,7 +140,7 @@ def _steps_data(run: Run, rows: Ints, origin: tuple[float, float]) -> dict[str, 
         "east": track.east[rows] - origin[1],
     }
     gaps = np.searchsorted(rows, np.flatnonzero(track.held[:-1] == 0.0), side="right") - 1
-    # First and last step of each stretch without a reference.
+    # The edges are the first and last steps of the stretches without a reference.
     edges = np.flatnonzero(np.diff(np.concatenate([[False], track.in_outage[rows], [False]]).astype(np.int8)))
     return {
         "gaps": np.unique(gaps).tolist(),

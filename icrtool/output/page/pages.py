@@ -53,7 +53,7 @@ from icrtool.output.text_format import (
     position_word,
     role_word,
     run_title,
-    signed,
+    signed_text,
 )
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import ErrorsAt, GroupComparison
@@ -301,7 +301,7 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
     counts_text = [f"{counts.done - unusable} can be used", f"{unusable} cannot", f"{counts.failed} failed{skipped}"]
     counts_text += [f"acceptance limits not met: {document.gates_failed}"] if document.gates_failed else []
     about = f"{len(logs)} logs: {', '.join(counts_text)}. Made with icrtool {document.tool_version}."
-    # Reasons without details of a single log: the first part of ``why; advice``.
+    # The first part of ``why; advice`` is the reason without details of a single log.
     reasons = Counter(log.reason.split(";")[0].split(" (tried")[0] for log in logs if log.status == "failed")
     why = Table("lr", [(reason, f"{count}") for reason, count in reasons.most_common()], ("reason", "logs"))
     pictures = pictures_in(Below(folder, "plots"))
@@ -333,7 +333,7 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
                 Cell(f"{calibration.multiplier:.3f}", f"± {calibration.multiplier_std:.3f}"),
                 Cell(distance, more=(between,) if between else ()),
             ]
-        icrs = ", ".join(map(signed, calibration.icrs_m))
+        icrs = ", ".join(map(signed_text, calibration.icrs_m))
         group_cell = [calibration.group] if grouped else []
         left_out = [", ".join(calibration.left_out)] if incomplete else []
         model = labels.get(calibration.recommended, calibration.recommended)
@@ -476,7 +476,7 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
         f"{name}: {counted(len(group.logs), 'log')}, {labels.get(group.model, group.model)}"
         for name, group in comparison.groups.items()
     )
-    # For each group: the errors of all calibrations in its runs, over distance.
+    # Each group has the errors of all calibrations in its runs, over distance.
     by_group: list[dict[str, object]] = []
     looks = rows_of(f"calibration:{name}" for name in names)
     for tested_on in names:

@@ -171,7 +171,7 @@ def _reach_card(calibration: Calibration) -> Section:
         text += f": the errors were measured at {', '.join(f'{h:g}' for h in horizons)} m, so it is {between}" * bool(
             between
         )
-    # A table of distances as `icrtool calibrate` prints it.
+    # The table of distances is that of `icrtool calibrate`.
     rows = [_held_out_distance(reached[name]) for name in shown_rows(names) if name in reached]
     table = Table("lrl", rows, (f"within {BUDGET_M:g} m (95 %)", "distance", ""))
     return Section("How far without GNSS?", [table], lead=lead, text=text, name="reach")

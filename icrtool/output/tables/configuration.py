@@ -43,7 +43,7 @@ def format_configuration(config: Config) -> str:
 
 
 def format_settings(config: Config) -> str:
-    """Return the keys that have a value as TOML, a key a line."""
+    """Return the keys that have a value as TOML, one on each line."""
     lines = []
     for section, keys in config.effective().items():
         lines += [f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in keys.items() if value is not None), ""]

@@ -86,7 +86,7 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     report : content of report.json; null for a number that is not known
     """
     summary = with_verdict(summary, report)
-    # Number of trials of the first row, at the horizon with trials that is nearest to `CHOICE_HORIZON_M`.
+    # The trials of the first row are counted at the horizon with trials that is nearest to `CHOICE_HORIZON_M`.
     counts = zip(report.trials, trials_of_first(report), strict=True)
     row, count = min(
         counts, key=lambda row_and_trials: (not row_and_trials[1], abs(row_and_trials[0].horizon_m - CHOICE_HORIZON_M))

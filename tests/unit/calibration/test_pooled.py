@@ -99,7 +99,7 @@ def test_a_block_that_is_spoilt_does_not_change_what_it_is_predicted_by() -> Non
     inside = (drive.distance > folds[-1].begin_m) & (drive.distance <= folds[-1].end_m)
     spoilt = replace(clean, track=drive._replace(north=drive.north * np.where(inside, 1.5, 1.0)))
     before, after = (hold_out([one], (5.0,)) for one in (clean, spoilt))
-    of_last = [one.without("recommended", folds[-1]) for one in (before, after)]
+    of_last = [one.fit_without("recommended", folds[-1]) for one in (before, after)]
     assert of_last[0] is not None
     assert of_last[1] is not None
     assert of_last[1][0].parameters == pytest.approx(of_last[0][0].parameters, abs=1e-2)

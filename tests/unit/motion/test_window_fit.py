@@ -185,7 +185,7 @@ def test_leaving_a_recording_out_is_near_a_fit_to_the_others(count: int, grown: 
     model = replace(EIGHT, stds=tuple(EIGHT.prior_std))
     recordings = [make_recording(model, model.prior_mean, seed) for seed in range(count)]
     whole, new = fit_to(model, *recordings), fit_to(model, *recordings[:-1])
-    found = whole.without(Fold("", count - 1, count - 1, -np.inf, np.inf))
+    found = whole.fit_without(Fold("", count - 1, count - 1, -np.inf, np.inf))
     assert found is not None
     quick, own = found
     away, moved = (np.abs(one.parameters - new.parameters) / new.std for one in (quick, whole))
@@ -203,7 +203,7 @@ def test_priors_are_as_wide_as_the_other_recordings_show() -> None:
     recordings = [make_recording(EIGHT, truth, seed, 120.0) for seed in range(5)]
     whole, widths = fit_to(EIGHT, *recordings), []
     for i in range(5):
-        found = whole.without(Fold("", i, i, -np.inf, np.inf))
+        found = whole.fit_without(Fold("", i, i, -np.inf, np.inf))
         assert found is not None
         model = found[0].model
         new = fit_to(model, *(one for one in recordings if one is not recordings[i]))
@@ -236,7 +236,7 @@ def test_a_pooled_fit_is_that_of_the_dense_least_squares() -> None:
 def test_what_is_left_beside_a_fold_is_not_enough() -> None:
     short = make_recording(EIGHT, EIGHT.prior_mean, seconds=60.0)
     found = fit_to(EIGHT, short)
-    assert found.without(Fold("", 0, 0, 5.0, float(short.track.distance[-1]))) is None
+    assert found.fit_without(Fold("", 0, 0, 5.0, float(short.track.distance[-1]))) is None
 
 
 def test_joined_steps_give_the_parameters_of_single_samples() -> None:

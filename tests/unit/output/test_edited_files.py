@@ -235,5 +235,5 @@ def test_states_of_no_row_or_far_too_many_are_refused(run_place: Path, tmp_path:
             writer.write_table(part)
     (place / "B2SUMS").write_text((place / "B2SUMS").read_text().replace("states.csv", "states.parquet"))
     write_run(place, (place / "run.json").read_bytes())
-    with pytest.raises(IcrToolError, match="too many for its size" if rows else "cannot be read"):
+    with pytest.raises(IcrToolError, match="more than a file of its size can hold" if rows else "cannot be read"):
         icrtool.open_run(place)

@@ -6,7 +6,7 @@ import pytest
 
 from icrtool.output.tables.run import format_run, run_checks
 from icrtool.output.text_blocks import TEXT_WIDTH
-from icrtool.output.text_format import duration_text, error_text, signed
+from icrtool.output.text_format import duration_text, error_text, signed_text
 from icrtool.records.run import Run
 from icrtool.records.text import distance_text
 from support.documents import with_summary
@@ -124,7 +124,7 @@ def test_lengths_read_well() -> None:
     texts = [error_text(metres) for metres in (0.0031, 0.0123, 0.999, 3.456, float("nan"))]
     assert texts == ["0.0031 m", "0.012 m", "0.999 m", "3.46 m", "-"]
     assert [distance_text(metres) for metres in (398.46, 36_004.6)] == ["398.5 m", "36.00 km"]
-    assert [signed(metres) for metres in (0.3, -0.3, -0.0001)] == ["+0.300", "−0.300", "0.000"]
+    assert [signed_text(metres) for metres in (0.3, -0.3, -0.0001)] == ["+0.300", "−0.300", "0.000"]
 
 
 def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: Run) -> None:

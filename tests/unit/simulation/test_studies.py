@@ -233,7 +233,7 @@ def test_from_its_start_the_filter_knows_robots_as_well_as_it_states(seconds: fl
         right, left = rng.uniform(1.0, 2.8, 2) * half
         plan = replace(base.plan, icrs_m=(right, -left, 0.4 * half * rng.standard_normal()), path=PathPlan("curved"))
         sensors = replace(base.sensors, input_noise_mps=0.05)
-        found = study_runs._filtered(study_runs.Scenario(plan, sensors, base.config), 0, seed)
+        found = study_runs._filter_run(study_runs.Scenario(plan, sensors, base.config), 0, seed)
         error = (found.x[-1] - found.truth[-1])[3:]
         nees.append(float(error @ np.linalg.solve(found.P[-1][3:, 3:], error)))
     assert np.mean(nees) < chdtri(3 * runs, 0.001) / runs
