@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +30,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 SCRIPT = load_script("schemas")
+schemas = functools.cache(SCRIPT.schemas)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +62,7 @@ def documents() -> dict[str, Any]:
 
 def test_the_schemas_in_the_documentation_are_those_of_the_code() -> None:
     stored = {file.name: file.read_text(encoding="utf-8") for file in SCRIPT.FOLDER.glob("*.json")}
-    assert stored == SCRIPT.schemas(), "run scripts/schemas.py"
+    assert stored == schemas(), "run scripts/schemas.py"
 
 
 @pytest.mark.parametrize("name", sorted(SCRIPT.DOCUMENTS))
@@ -93,5 +95,5 @@ def undocumented(value: Any, schema: dict[str, Any], whole: dict[str, Any], plac
 
 @pytest.mark.parametrize("name", sorted(SCRIPT.DOCUMENTS))
 def test_no_key_is_undocumented(documents: dict[str, Any], name: str) -> None:
-    schema = json.loads(SCRIPT.schemas()[f"{name}-1.json"])
+    schema = json.loads(schemas()[f"{name}-1.json"])
     assert not list(undocumented(documents[name], schema, schema))

@@ -75,9 +75,9 @@ def test_a_run_is_calibrated_with_its_configuration(icrtool, field: Path, tmp_pa
     assert "keeps its own configuration" in err
 
 
-def test_settings_can_be_pasted(icrtool) -> None:
+def test_settings_can_be_pasted(icrtool, field: Path) -> None:
     wrong = ("--set", "wheels.left_scale=0.97", "--set", "wheels.right_scale=1.0")
-    _, out, _ = icrtool("calibrate", LOG, *ROBOT, *wrong)
+    _, out, _ = icrtool("calibrate", field, *HUSKY, *wrong)
     line = next(line for line in out.splitlines() if "--set" in line)
     sets = [word for word in line.split() if word != "--set"]
     assert load_config(sets=sets).wheels.left_scale == pytest.approx(1.0, abs=0.01)
