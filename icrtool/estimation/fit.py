@@ -138,7 +138,7 @@ def _first_from(stamps: Ints, at: int) -> int:
 
 
 def _joined(jumps: list[ReferenceJump], near_ns: int) -> list[ReferenceJump]:
-    """Return jumps, of which those that begin at most `near_ns` after the end of the jump before are joined to it."""
+    """Return jumps; a jump that begins at most `near_ns` after the end of the jump before is joined to it."""
     joined: list[ReferenceJump] = []
     for jump in sorted(jumps, key=attrgetter("begin_ns")):
         if not joined or jump.begin_ns > joined[-1].end_ns + near_ns:

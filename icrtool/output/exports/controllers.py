@@ -131,7 +131,7 @@ def _driven(calibration: Calibration) -> tuple[int, str, float]:
 
 
 def export_origin(calibration: Calibration) -> str:
-    """Return a line on the program, the logs, when and how far they were driven, and the robot."""
+    """Return a line with the program, the logs, their date and distance, and the robot."""
     _, date, distance_m = _driven(calibration)
     robot = f", {one_line(name)}" if (name := calibration.robot.name) else ""
     # The calibration of a report has no date, so that the same run gives the same file.

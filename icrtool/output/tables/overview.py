@@ -54,7 +54,7 @@ def info_blocks(
     survey: SurveyDocument | None, log: RobotLog | None, run: Run | None, problem: IcrToolError | None,
     names: tuple[str, str], config: Config, command: str | None, scorable: Sequence[str] = (),
 ) -> list[Block]:  # fmt: skip
-    """Return what `icrtool info` prints: the verdict, what was driven, each topic once, what is missing and next.
+    """Return the output of `icrtool info`: verdict, drive, each topic once, what is missing, and the next command.
 
     Parameters
     ----------

@@ -164,7 +164,7 @@ def unusable_line(summary: RunDocument) -> Line:
 
 
 def warnings_line(notes: Sequence[Note]) -> str:
-    """Return how many warnings there are, and what the first of the highest grade found; none: empty."""
+    """Return the number of warnings, and the finding of the first of the highest grade; empty without warnings."""
     count, first = sum(not is_grave(finding) for finding in notes), first_to_read(notes)
     return f"{counted(count, 'warning')} (-v): {first.finding}" if first is not None else ""
 
