@@ -131,7 +131,8 @@ def test_the_stretches_of_a_drive_on_several_grounds_are_whole(screen: Screen, t
     # half the separation of the ICRs is 0.3 m or 0.45 m by turns
     icrs = ("0.3,-0.3,0.05", "0.45,-0.45,0.05")
     changes = [word for place, at_s in enumerate(times_s) for word in ("--change", f"{at_s}:{icrs[place % 2]}")]
-    assert screen("simulate", "-o", "grounds.mcap", "--duration", "240", "-q", *ROBOT, *changes)[0] == 0
+    rates = ("--wheel-rate", "50", "--heading-rate", "50")
+    assert screen("simulate", "-o", "grounds.mcap", "--duration", "240", "-q", *ROBOT, *rates, *changes)[0] == 0
     status, lines = screen("fit", "grounds.mcap", *ROBOT, "--plots", "none")
     # the next command is one line, however long
     check_fits([line[:COLUMNS] if line.startswith("next ") else line for line in lines])
