@@ -19,7 +19,7 @@ from icrtool.alignment.ground_change import find_changes
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken_intervals
 from icrtool.alignment.sparse_reference import spans_of_measured
-from icrtool.alignment.wheel_units import Scale, is_wrong_size, radius_hint
+from icrtool.alignment.wheel_units import Scale, radius_hint, wrong_size
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, rows_at_steps, unwrapped
 from icrtool.kernels.robust import robust_regression, sandwich_covariance
@@ -241,6 +241,9 @@ def _find_scales(
     -----
     The difference of the sides is the ratio of the turn rate's asymmetry to its gain. With such a difference a robot
     veers where both sides report one speed. The mean of the two factors is the scale.
+
+    `with_right_size` has corrected a wrong wheel size before, where enough spans are straight or bend little. On other
+    paths, as tight curves, the size is found here: the estimator's windows show the distance along any path.
     """
     if fit.slips:
         apart = f"their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
@@ -261,9 +264,9 @@ def _find_scales(
             factor = scale
             done = "corrected; wheels.left_scale and right_scale set it"
             notes.append(note("wheel_scale_corrected", f"{text}: {done}"))
-        elif may and is_wrong_size(Scale(scale, std), log):
+        elif may and (finding := wrong_size(Scale(scale, std), log, config)) is not None:
             factor = scale
-            notes.append(note("wheel_size_wrong", f"{text}: corrected; {check}"))
+            notes.append(finding)
         else:
             notes.append(note("wheel_scale_differs", f"{text}: {check}"))
     (asymmetry, asymmetry_std), (turn, turn_std) = fit.estimate("asymmetry"), fit.estimate("turn")

@@ -22,7 +22,7 @@ from icrtool.alignment.log_track import (
     cut_chords,
     track_of_streams,
 )
-from icrtool.config import Config
+from icrtool.config import Config, builtin_robots
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.robust import mad_std
@@ -154,38 +154,43 @@ def with_right_size(log: RobotLog, config: Config) -> tuple[RobotLog, float]:
     scale = reference_scale(wheels.stamp_ns, wheels.v_left_mps, wheels.v_right_mps, log.gnss)
     if scale is None or abs(scale.value - 1.0) <= ROLLING_SCALE + EVIDENCE_SIGMAS * scale.std:
         return log, 1.0
-    if not is_wrong_size(scale, log):
+    finding = wrong_size(scale, log, config)
+    if finding is None:
         return log, 1.0
     factor = scale.value
     size = replace(wheels, left=factor * wheels.v_left_mps, right=factor * wheels.v_right_mps)
-    text = (
-        f"the robot goes {_with_std(Scale(100.0 * factor, 100.0 * scale.std))} % of the distance that the wheels report"
-    )
-    check = f"corrected; {radius_hint(log, config, factor)}wheel radius, encoder resolution, gear and units"
-    found = notes_about(log.name, [note("wheel_size_wrong", f"{text}: {check}")])
-    return replace(log, wheels=size, notes=(*log.notes, *found)), factor
+    return replace(log, wheels=size, notes=(*log.notes, *notes_about(log.name, [finding]))), factor
 
 
-def is_wrong_size(scale: Scale, log: RobotLog) -> bool:
-    """Return whether a scale beyond tyres and soil is a constant factor of the wheels.
+def wrong_size(scale: Scale, log: RobotLog, config: Config) -> Note | None:
+    """Return the finding that the wheel speeds have a constant factor, which is corrected; None without such a factor.
 
-    Where the reference is no GNSS, its own unit or scale may be wrong, as in visual SLAM: then only a factor of two,
-    which is a diameter in place of a radius, is the wheels'.
+    Where the reference is no GNSS, its own unit or scale may be wrong, as in visual SLAM. Then only a factor of two is
+    a factor of the wheels: a diameter was used as a radius, or the reverse.
+
+    Parameters
+    ----------
+    scale : differs from 1 by more than tyres and soil explain
     """
     if not (scale.value > 0.0 and scale.std <= LARGEST_SIZE_STD * scale.value):
-        return False
-    return log.datum is not None or any(abs(scale.value / two - 1.0) < FACTOR_TWO_TOLERANCE for two in (0.5, 2.0))
+        return None
+    if log.datum is None and all(abs(scale.value / two - 1.0) >= FACTOR_TWO_TOLERANCE for two in (0.5, 2.0)):
+        return None
+    percent = _with_std(Scale(100.0 * scale.value, 100.0 * scale.std))
+    check = f"{radius_hint(log, config, scale.value)}wheel radius, encoder resolution, gear and units"
+    text = f"the robot goes {percent} % of the distance that the wheels report: corrected; {check}"
+    return note("wheel_size_wrong", text)
 
 
 def radius_hint(log: RobotLog, config: Config, scale: float) -> str:
     """Return a text on the wheel radius that the log shows; "check " where the wheel speeds need no radius."""
-    radius_m = config.robot.wheel_radius_m
+    robot, radius_m = config.robot.name, config.robot.wheel_radius_m
     by_radius = any(one.role == "wheels" and _ANGLES.search(one.why) for one in log.streams)
     if radius_m is None or not by_radius:
         return "check "
-    robot = f"{config.robot.name} has {radius_m:g} m" if config.robot.name else f"{radius_m:g} m is configured"
-    question = "is --robot right? check" if config.robot.name else "check"
-    return f"the log shows a wheel radius of {scale * radius_m:.3f} m, {robot}: {question} "
+    of_robot = radius_m == builtin_robots().get(robot, {}).get("wheel_radius_m")
+    given = f"{robot} has {radius_m:g} m: is --robot right?" if of_robot else f"robot.wheel_radius_m is {radius_m:g} m:"
+    return f"the log shows a wheel radius of {scale * radius_m:.3f} m, {given} check "
 
 
 _ANGLES = re.compile(r" in (rad|counts)")

@@ -133,7 +133,7 @@ def residuals_of(
     seen, seen_turned = windows.moved, windows.turned
     knots, rows = np.unique([windows.begin, windows.end], return_inverse=True)
     knot_t, (start, end) = steps.place_t[knots], rows.reshape(2, -1)
-    columns_at = step_columns(steps, wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro), model, wheels)
+    columns_at = _step_columns(steps, wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro), model, wheels)
 
     def evaluate(parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
         offset, delay = constants[:CONSTANTS_OF_WHEELS].tolist()
@@ -166,7 +166,7 @@ class StepColumns(NamedTuple):
     values: Floats
 
 
-def step_columns(
+def _step_columns(
     steps: Track, motion: WheelMotion, model: MotionModel, wheels: FittedModel | None = None
 ) -> Callable[[Floats, Floats], StepColumns]:
     """Return a function for the columns of a track's steps, for parameters (k,) and constants (c,).
