@@ -188,7 +188,7 @@ def radius_hint(log: RobotLog, config: Config, scale: float) -> str:
     by_radius = any(one.role == "wheels" and _ANGLES.search(one.why) for one in log.streams)
     if radius_m is None or not by_radius:
         return "check "
-    of_robot = radius_m == builtin_robots().get(robot, {}).get("wheel_radius_m")
+    of_robot = radius_m == builtin_robots().get(robot or "", {}).get("wheel_radius_m")
     given = f"{robot} has {radius_m:g} m: is --robot right?" if of_robot else f"robot.wheel_radius_m is {radius_m:g} m:"
     return f"the log shows a wheel radius of {scale * radius_m:.3f} m, {given} check "
 

@@ -96,9 +96,7 @@ def measure_errors(
         raise DataError(run.name, f"the run has {counted(len(run.table), 'state')}", "at least two are needed")
     horizons = check_horizons(horizons_m)
     track = track if track is not None else track_of(run)
-    predictors: list[Model | ComparedRow] = [*(models if models is not None else models_of(run)), *further]
-    if len({model.name for model in predictors}) < len(predictors):
-        raise ValueError("two models have the same name")
+    predictors = _predictors(models if models is not None else models_of(run), further)
     standing, learned = standing_states(track), first_learned(run)
     sparse = starts_of_further if starts_of_further is not None else _sparse_starts(standing)
     sparse_errors = _errors_of_few(track, predictors, Trials(sparse, counted_ends(track, horizons, starts, sparse)))
@@ -117,21 +115,18 @@ def measure_errors(
                 zip(predictors, sparse_errors, by_model, strict=True), start=1
             ):
                 watch(f"errors, row {number} of {len(predictors)}")
-                if isinstance(model, ComparedRow):
+                if is_compared := isinstance(model, ComparedRow):
                     errors = of_few.position[:, columns]
-                    sparse_trials = trials.at(sparse, group, errors)
-                    rows.extend(_statistics(model, group, errors, of_few, columns, sparse_trials, each))
-                    if sink is not None:
-                        sink(model.name, group, _at_all_starts(errors, sparse, len(track.distance)))
-                    continue
-                errors = _errors(track, model, ends, pool)
-                rows.extend(_statistics(model, group, errors, of_few, columns, trials, each))
+                    tried = trials.at(sparse, group, errors)
+                else:
+                    errors, tried = _errors(track, model, ends, pool), trials
+                rows.extend(_statistics(model, group, errors, of_few, columns, tried, each))
                 if model.name == "icr":
                     before += each(_row, group.tolist(), errors[:learned].T)
                     after += each(_row, group.tolist(), errors[len(errors) if learned is None else learned :].T)
                 if sink is not None:
-                    sink(model.name, group, errors)
-                del errors  # The memory is freed before the next model.
+                    sink(model.name, group, _at_all_starts(errors, sparse, len(run.table)) if is_compared else errors)
+                del errors, tried  # The memory is freed before the next model.
             counts.append(count_trials(ends.T))
             drawn.append(drawn_trials(group, ends))
     return OpenLoopErrors(
@@ -144,6 +139,14 @@ def measure_errors(
         reference=reference_error(run, drawn, seed),
         by_learning=_by_learning(run, learned, before, after),
     )
+
+
+def _predictors(models: Sequence[Model], further: Sequence[ComparedRow]) -> list[Model | ComparedRow]:
+    """Return all models of a report; two of one name are refused."""
+    predictors: list[Model | ComparedRow] = [*models, *further]
+    if len({model.name for model in predictors}) < len(predictors):
+        raise ValueError("two models have the same name")
+    return predictors
 
 
 def _sparse_starts(standing: Bools) -> Ints:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from msgspec.structs import asdict
@@ -99,8 +100,6 @@ def summarise(
     )  # fmt: skip
     notes = (*notes, *notes_about(sensors.name, unusable))
     hidden = () if config.filter.rules.final_of_filter else excitation.verdict.not_shown
-    lag = measurements.findings["heading_delay_s"]
-    start_ns = int(table.stamp_ns[0])
     return RunDocument(
         schema=RUN_SCHEMA,
         tool_version=__version__,
@@ -120,15 +119,10 @@ def summarise(
         terrain=TerrainDocument(tuple(map(ChangeDocument, changes_s))),
         segments=segment_summary(table, changes_s),
         gnss=gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes, measurements),
-        heading=HeadingDocument(
-            **asdict(measurements.heading), delay_s=lag.value, delay_std_s=lag.std,
-            applied_delay_s=lag.applied, used=_count(filtered.heading.used), rejected=_count(filtered.heading.rejected),
-        ),
+        heading=_heading_document(measurements, filtered),
         wheels=measurements.wheels,
-        events=tuple(EventDocument(**(asdict(event) | _seconds(event, start_ns))) for event in sensors.events),
-        reference_jumps=tuple(
-            ReferenceJumpDocument(**(asdict(jump) | _seconds(jump, start_ns))) for jump in sensors.jumps
-        ),
+        events=tuple(EventDocument(**_span_with_seconds(event, table)) for event in sensors.events),
+        reference_jumps=tuple(ReferenceJumpDocument(**_span_with_seconds(jump, table)) for jump in sensors.jumps),
         outages_ns=_spans(filtered.outages_ns),
         rtk_losses_ns=_spans(sensors.losses_ns),
         wheel_gaps_ns=_spans(table.stamp_ns[np.flatnonzero(filtered.in_gap)[:, None] + [0, 1]]),
@@ -287,9 +281,20 @@ def _speed_while_turning(table: States) -> float:
     return float(turning @ (table.v_left_mps + table.v_right_mps)) / 2 / max(float(turning.sum()), 1e-12)
 
 
-def _seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, float]:
-    """Return begin and end of a span in seconds since the first recorded state, whose stamp is `start_ns`."""
-    return {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
+def _span_with_seconds(span: SlipEvent | ReferenceJump, table: States) -> dict[str, Any]:
+    """Return the fields of a span, and its begin and end in seconds since the first recorded state."""
+    start_ns = int(table.stamp_ns[0])
+    seconds = {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
+    return asdict(span) | seconds
+
+
+def _heading_document(measurements: Measurements, filtered: Filtered) -> HeadingDocument:
+    """Return the facts about the heading, its delay, and how many headings the filter used and rejected."""
+    lag = measurements.findings["heading_delay_s"]
+    return HeadingDocument(
+        **asdict(measurements.heading), delay_s=lag.value, delay_std_s=lag.std, applied_delay_s=lag.applied,
+        used=_count(filtered.heading.used), rejected=_count(filtered.heading.rejected),
+    )  # fmt: skip
 
 
 def icr_summary(

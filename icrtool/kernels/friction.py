@@ -95,6 +95,41 @@ def contact_forces(
     return force_x, force_y, moment
 
 
+@njit_part
+def second_moments(contact_x: Floats, contact_y: Floats) -> tuple[float, float]:
+    """Return the sums of the squared places of contacts (c,) ahead and to the right [m^2]."""
+    sum_xx, sum_yy = 0.0, 0.0
+    for i in range(len(contact_x)):
+        sum_xx += contact_x[i] * contact_x[i]
+        sum_yy += contact_y[i] * contact_y[i]
+    return sum_xx, sum_yy
+
+
+@njit_part
+def driver_commands(forward: float, turn: float, heading_error: float, body: SlidingBody) -> tuple[float, float]:
+    """Return the track speeds [m/s], left and right, that the driver commands.
+
+    Parameters
+    ----------
+    forward, turn : velocity [m/s] and turn rate [rad/s] that the driver wants
+    heading_error : wanted minus true heading [rad], which the driver steers against
+    """
+    wanted = turn + body.steering * heading_error
+    wanted = min(max(wanted, -body.largest_turn), body.largest_turn)
+    return forward - body.y_left * wanted, forward - body.y_right * wanted
+
+
+@njit_part
+def moved_pose(
+    north: float, east: float, psi: float, v_x: float, v_y: float, omega: float, dt: float
+) -> tuple[float, float, float]:
+    """Return the pose N, E [m], psi [rad] after `dt` [s] at a body velocity [m/s] and a turn rate [rad/s]."""
+    middle = psi + 0.5 * dt * omega
+    north += dt * (v_x * math.cos(middle) - v_y * math.sin(middle))
+    east += dt * (v_x * math.sin(middle) + v_y * math.cos(middle))
+    return north, east, psi + dt * omega
+
+
 @njit
 def slide(
     t: Floats, forward: Floats, turn: Floats, heading: Floats, decides: Ints, contact_x: Floats, contact_y: Floats,
@@ -121,10 +156,8 @@ def slide(
     semi-implicit Euler steps of at most `LONGEST_SUBSTEP_S`. The load shifts with the acceleration and the height of
     the centre of mass.
     """
-    cells, sum_xx, sum_yy = len(grip), 0.0, 0.0
-    for i in range(len(contact_x)):
-        sum_xx += contact_x[i] * contact_x[i]
-        sum_yy += contact_y[i] * contact_y[i]
+    cells = len(grip)
+    sum_xx, sum_yy = second_moments(contact_x, contact_y)
     north, east, psi = pose[0, 0], pose[0, 1], pose[0, 2]
     # The state is the velocity of the centre of mass, track speeds, commands, the acceleration that the load follows,
     # and the distance.
@@ -133,9 +166,7 @@ def slide(
     a_x, a_y, driven = 0.0, 0.0, 0.0
     for k in range(len(t)):
         if decides[k]:
-            wanted = turn[k] + body.steering * (heading[k] - psi)
-            wanted = min(max(wanted, -body.largest_turn), body.largest_turn)
-            command_left, command_right = forward[k] - body.y_left * wanted, forward[k] - body.y_right * wanted
+            command_left, command_right = driver_commands(forward[k], turn[k], heading[k] - psi, body)
         if k == 0:
             left, right, u = command_left, command_right, forward[0]
             omega = turn[0]
@@ -172,10 +203,7 @@ def slide(
             )
             v_y = w - omega * body.mass_forward
             v_x = u + omega * body.mass_right
-            middle = psi + 0.5 * dt * omega
-            north += dt * (v_x * math.cos(middle) - v_y * math.sin(middle))
-            east += dt * (v_x * math.sin(middle) + v_y * math.cos(middle))
-            psi += dt * omega
+            north, east, psi = moved_pose(north, east, psi, v_x, v_y, omega, dt)
             driven += dt * math.sqrt(v_x * v_x + v_y * v_y)
         # The mean speed over the step gives the distance that the tracks travelled.
         tracks[k, 0], tracks[k, 1] = mean_left, mean_right

@@ -141,13 +141,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         notes += [
             note("heading_unusable", f"{one.topic} gives no heading: {one.problem}") for one in candidates.heading
         ]
-    unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
-    used_topics = [topic_of_side(side) for one in chosen.values() for side in one.topic.split(" + ")]
-    notes += [
-        note("messages_unreadable", f"{topic}: {unreadable[topic]} messages do not fit their message type; left out")
-        for topic in dict.fromkeys(used_topics)
-        if topic in unreadable
-    ]
+    notes += _unreadable_notes(survey.tables, chosen.values())
     antenna = antenna_place(survey.tables, position.topic)
     place = "" if antenna is None else f"antenna {antenna[0]:+z.2f} m forward, {antenna[1]:+z.2f} m right of the base"
     read: dict[Role, tuple[Samples, str]] = {
@@ -155,12 +149,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         "gnss": (gnss, f"; {place} (/tf_static)" if place else ""),
         "heading": (heading, f"; {convention}"),
     }
-    streams = []
-    for role, one in chosen.items():
-        samples, detail = read[role]
-        used, count = clock if one.stamps.header_ns is not None else "log", len(samples.stamp_ns)
-        rate, jitter = rate_and_jitter(samples.stamp_ns)
-        streams.append(StreamChoice(role, one.topic, one.message_type, count, rate, used, jitter, one.why + detail))
+    streams = tuple(_stream_choice(role, one, *read[role], clock) for role, one in chosen.items())
     # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
     others = [
         one for one in candidates.gnss if one.geodetic is not None and not one.problem and one.topic != position.topic
@@ -177,11 +166,31 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     gyro = None if gyro is not None and is_too_fast(gyro.rate_radps[:, None]) else gyro
     notes += [note("gyro_in_degrees", f"{one}: its turn rates are in deg/s, not rad/s: converted") for one in degrees]
     log = RobotLog(
-        name, wheels, gnss, heading, datum, tuple(streams), survey.inputs, dict(position.rejected),
+        name, wheels, gnss, heading, datum, streams, survey.inputs, dict(position.rejected),
         (*survey.problems, *notes_about(name, notes)), antenna, gyro, gyros, tuple(receivers),
         heading_sensor=None if source is None else _heading_sensor(source, config),
     )  # fmt: skip
     return longest_part(log)
+
+
+def _unreadable_notes(tables: Iterable[TopicTable], chosen: Iterable[Source]) -> list[Note]:
+    """Return a finding for each chosen topic with messages that do not fit their type."""
+    unreadable: dict[str, int] = {table.topic: table.unreadable for table in tables if table.unreadable}
+    used_topics = [topic_of_side(side) for one in chosen for side in one.topic.split(" + ")]
+    return [
+        note("messages_unreadable", f"{topic}: {unreadable[topic]} messages do not fit their message type; left out")
+        for topic in dict.fromkeys(used_topics)
+        if topic in unreadable
+    ]
+
+
+def _stream_choice(role: Role, source: Source, samples: Samples, detail: str, clock: Clock) -> StreamChoice:
+    """Return what run.json states of a stream: its source, number, rate and clock; `detail` is added to the reason."""
+    used = clock if source.stamps.header_ns is not None else "log"
+    rate, jitter = rate_and_jitter(samples.stamp_ns)
+    return StreamChoice(
+        role, source.topic, source.message_type, len(samples.stamp_ns), rate, used, jitter, source.why + detail
+    )
 
 
 def _clock_of(chosen: Mapping[Role, Source], config: Config) -> tuple[Callable[[StampedRows], StampedRows], list[Note]]:
