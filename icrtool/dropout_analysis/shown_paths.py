@@ -85,6 +85,11 @@ class StartErrors(NamedTuple):
         return PathErrors(self.name, self.horizon_m, start, self.error_m[start])
 
 
+def _track(run: Run, compared: ComparedModels | None) -> Track:
+    """Return the track of a run, where there is one the track that its models were compared on: it is the same."""
+    return track_of(run) if compared is None else compared.track
+
+
 def errors_by_start(
     run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, *, starts: Starts = "moving"
 ) -> StartErrors:
@@ -96,7 +101,7 @@ def errors_by_start(
     horizon_m : length of the trials [m]
     starts : states that trials start from
     """
-    track, icrs = track_of(run), models_of(run)[0]
+    track, icrs = _track(run, compared), models_of(run)[0]
     ends = counted_ends(track, np.array([horizon_m]), starts)
     rows = compared.rows if compared is not None else ()
     held_out = next((row for row in rows if row.name == RECOMMENDED), None)
@@ -123,7 +128,7 @@ def worst_trials(
     errors : result of `errors_by_start`; default: it is computed
     """
     of_starts = errors_by_start(run, compared, horizon_m, starts=starts) if errors is None else errors
-    track, models, ends = track_of(run), models_of(run), of_starts.end
+    track, models, ends = _track(run, compared), models_of(run), of_starts.end
     untaken = np.nan_to_num(of_starts.error_m, nan=-1.0)
     chosen: list[int] = []
     while len(chosen) < count and untaken[worst := int(np.argmax(untaken))] >= 0.0:

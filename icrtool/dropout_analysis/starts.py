@@ -33,7 +33,9 @@ STANDING_MPS = 0.01
 
 def standing_states(track: Track) -> Bools:
     """Return which states (n,) begin an interval in which the robot stands; False for the last state."""
-    standing: Bools = (np.abs(track.v_left) < STANDING_MPS) & (np.abs(track.v_right) < STANDING_MPS)
+    standing = np.ones(len(track.v_left), np.bool_)
+    for speed in (track.v_left, track.v_right):
+        standing &= (speed > -STANDING_MPS) & (speed < STANDING_MPS)
     standing[-1:] = False
     return standing
 
@@ -46,10 +48,9 @@ def counted_ends(track: Track, horizons_m: Floats, counted: Starts, starts: Ints
     counted : ``moving``: each standstill counts once; ``all``: every state counts
     starts : (k,) states that trials start from; default: all states
     """
-    starts = starts if starts is not None else np.arange(len(track.distance))
-    ends = ends_from(track, horizons_m, starts)
+    ends = ends_from(track, horizons_m, starts if starts is not None else np.arange(len(track.distance)))
     if counted == "moving":
-        standing = standing_states(track)[starts]
+        standing = standing_states(track) if starts is None else standing_states(track)[starts]
         for column in ends.T:
             column[standing & (column >= 0)] = STANDING
     return ends

@@ -350,7 +350,11 @@ def read_measurements(
         attitude = None
         if "attitude_stamp_ns" in columns:
             attitude = HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
-            attitude = replace(attitude, var_rad2=without_repeats(attitude.var_rad2))
+            stamps_ns = attitude.stamp_ns
+            if gyro is not None and np.array_equal(stamps_ns, gyro.stamp_ns):
+                # Most inertial units send attitude and turn rate in one message: both columns share their memory.
+                stamps_ns = gyro.stamp_ns
+            attitude = replace(attitude, stamp_ns=stamps_ns, var_rad2=without_repeats(attitude.var_rad2))
         sensors = SensorData(
             name=document.log,
             wheels=WheelSamples(stamps, left, right),

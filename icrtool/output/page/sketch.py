@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.calibration.record import Calibration
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import ROWS_AT_ONCE
 from icrtool.output.series import round_steps
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import GroupComparison
@@ -55,15 +56,21 @@ def drive_sketch(run: Run, report: DropoutDocument) -> Sketch:
     # The view is at least one metre wide, because the drive of a robot that stands has no extent.
     scale = float(np.min(free / np.maximum(high - low, 1.0)))
     middle = (low + high) / 2.0
-    x = WIDTH / 2.0 + scale * (east - middle[0])
-    y = HEIGHT / 2.0 - scale * (north - middle[1])
-    worst = ""
+
+    def points(begin: int, end: int) -> Iterator[tuple[float, float]]:
+        """Yield the places of some states in the drawing, without lists of all states."""
+        for lo in range(begin, end, ROWS_AT_ONCE):
+            some = slice(lo, min(lo + ROWS_AT_ONCE, end))
+            x, y = WIDTH / 2.0 + scale * (east[some] - middle[0]), HEIGHT / 2.0 - scale * (north[some] - middle[1])
+            yield from zip(x.tolist(), y.tolist(), strict=True)
+
+    worst, states = "", len(run.table)
     if report.worst:
         first, last = _rows_of_trial(run, report.worst[0].t_s, report.worst[0].horizon_m)
-        worst = _svg_path(x[first : last + 1], y[first : last + 1])
+        worst = _svg_path(points(first, last + 1))
     bar_m = _round_length(LONGEST_BAR * WIDTH / scale)
-    start, end = ((round(float(x[row]), 1), round(float(y[row]), 1)) for row in (0, -1))
-    return Sketch(_svg_path(x, y), worst, start, end, round(bar_m * scale, 1), bar_m)
+    start, end = ((round(x, 1), round(y, 1)) for row in (0, states - 1) for x, y in points(row, row + 1))
+    return Sketch(_svg_path(points(0, states)), worst, start, end, round(bar_m * scale, 1), bar_m)
 
 
 def _rows_of_trial(run: Run, begin_s: float, horizon_m: float) -> tuple[int, int]:
@@ -74,11 +81,11 @@ def _rows_of_trial(run: Run, begin_s: float, horizon_m: float) -> tuple[int, int
     return begin, min(end, last)
 
 
-def _svg_path(x: Floats, y: Floats) -> str:
-    """Return an SVG path through points (n,); a point that is closer than `NEAR` to the point before is left out."""
+def _svg_path(points: Iterable[tuple[float, float]]) -> str:
+    """Return an SVG path through points; a point that is closer than `NEAR` to the point before is left out."""
     parts: list[str] = []
     before = (math.inf, math.inf)
-    for point in zip(x.tolist(), y.tolist(), strict=True):
+    for point in points:
         if math.dist(before, point) >= NEAR:
             parts.append(f"{point[0]:.1f} {point[1]:.1f}")
             before = point
