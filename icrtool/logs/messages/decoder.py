@@ -304,7 +304,7 @@ class Decoded:
             values = np.where(big[self.shape_of, None], values.byteswap(), values)
         if kind.char == "f":
             with np.errstate(invalid="ignore"):  # a signalling NaN becomes a NaN
-                values = values.astype(result)
+                values = values.astype(result, copy=False)
         else:
             values = values.astype(result, copy=False)
         if len(offsets) > 1:
@@ -323,7 +323,7 @@ class Decoded:
         if not len(self.start):
             return np.empty((0, 0) if "[*]" in path else 0, np.int64)
         width = max((len(shape.taken[slot.number]) for shape in self.shapes if shape.readable), default=0)
-        numbers: Ints = np.full((len(self.start), width), -1, np.int64)
+        numbers: Ints = np.empty((0, width), np.int64)
         for shape, rows in self.by_shape():
             codes = []
             for at, length in shape.taken[slot.number]:
@@ -336,8 +336,10 @@ class Decoded:
                 is_one = bool(as_first(texts, 0, length).all())
                 codes.append(text_numbers(texts[: 1 if is_one else None].tolist(), known))
             if len(self.shapes) == 1 and all(len(one) == 1 for one in codes):
-                numbers = np.broadcast_to(np.array(codes, np.int64).reshape(1, width), numbers.shape)
+                numbers = np.broadcast_to(np.array(codes, np.int64).reshape(1, width), (len(self.start), width))
                 break
+            if not len(numbers):
+                numbers = np.full((len(self.start), width), -1, np.int64)
             for place, one in enumerate(codes):
                 numbers[rows, place] = one
         return numbers if "[*]" in path else numbers[:, 0]

@@ -5,6 +5,7 @@ The decoder is chosen by message type and by how messages are serialized.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -88,8 +89,9 @@ def _copy(source: NDArray[Any], target: NDArray[Any]) -> None:
     if target.dtype.kind != "f":
         target[...] = source
         return
+    target[...] = source  # copied first: source and target may differ in the order of their memory
     with np.errstate(invalid="ignore"):
-        np.multiply(source, 1.0, out=target)
+        np.multiply(target, 1.0, out=target)
     if target.size and not (target.min() >= -LARGEST_VALUE and target.max() <= LARGEST_VALUE):  # NaN compares false
         np.copyto(target, np.copysign(np.inf, target), where=np.abs(target) > LARGEST_VALUE)
 
@@ -216,7 +218,7 @@ class TopicCollector:
     channel: Channel
     decoders: dict[int, MessageDecoder] = field(default_factory=dict)
     _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
-    _numbers: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
+    _numbers: list[tuple[int, int]] = field(default_factory=list)
     _columns: dict[tuple[str, bool], GrowingColumn] = field(default_factory=dict)
     _texts: dict[str, dict[bytes, int]] = field(default_factory=dict)
     _unreadable: int = 0
@@ -234,7 +236,7 @@ class TopicCollector:
             if not len(readable):
                 continue
             self._times.add(block.log_time_ns[readable], expected)
-            self._numbers.add(np.full(len(readable), number), expected)
+            self._numbers.append((number, len(readable)))
             for path, kind in decoder.kinds.items():
                 values: NDArray[Any]
                 if is_text := kind == "string":
@@ -249,9 +251,9 @@ class TopicCollector:
 
         Publishers may have been built from different versions of the type: columns that all publishers have are kept.
         """
-        times, numbers = self._times.taken(), self._numbers.taken()
+        times = self._times.taken()
         # each publisher by itself: one may be recorded later than another
-        stored = [times] if len(self.decoders) == 1 else [times[numbers == one] for one in self.decoders]
+        stored = [times] if len(self.decoders) == 1 else _of_each(times, self._numbers, self.decoders)
         back = max(map(set_back_of, stored), default=NOT_SET_BACK)
         order = None if (times[1:] >= times[:-1]).all() else np.argsort(times, kind="stable")
         columns: dict[str, NDArray[Any]] = {}
@@ -266,6 +268,12 @@ class TopicCollector:
         topic, message_type = self.channel.topic, self.channel.message_type
         times = times if order is None else times[order]
         return TopicTable(topic, message_type, times, columns, texts, self._unreadable, back)
+
+
+def _of_each(times: Ints, stretches: list[tuple[int, int]], channels: Iterable[int]) -> list[Ints]:
+    """Return the log times (n,) of each channel; `stretches`: channel and number of messages that follow each other."""
+    numbers = np.repeat(*np.array(stretches, np.int64).reshape(-1, 2).T)
+    return [times[numbers == channel] for channel in channels]
 
 
 def set_back_of(times: Ints) -> SetBack:

@@ -118,6 +118,11 @@ def _of_second_publisher(positions: Sequence[NDArray[Any]], speeds: Sequence[NDA
     )
     for column, weight in zip(columns, np.sqrt(np.arange(2.0, len(columns) + 2.0)), strict=True):
         finite = np.isfinite(column)
+        if finite.all():
+            sums += weight * column
+            zero &= column == 0.0
+            known[:] = True
+            continue
         sums += weight * np.where(finite, column, 0.0)
         zero &= (column == 0.0) | ~finite
         known |= finite
