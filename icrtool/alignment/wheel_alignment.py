@@ -21,7 +21,7 @@ from icrtool.alignment.sensor_noise import unbroken_intervals
 from icrtool.alignment.sparse_reference import spans_of_measured
 from icrtool.alignment.wheel_units import Scale, radius_hint, wrong_size
 from icrtool.config import Config
-from icrtool.kernels.arrays import Bools, rows_at_steps, unwrapped
+from icrtool.kernels.arrays import Bools, Ints, rows_at_steps, unwrapped
 from icrtool.kernels.robust import robust_regression, sandwich_covariance
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import Fixes, WheelFacts
@@ -88,26 +88,31 @@ def with_scaled_wheels(log: RobotLog, left_factor: float, right_factor: float) -
     )
 
 
-def _contradicted(wheels: WheelSamples, fixes: Fixes) -> Bools:
-    """Return in which intervals (n - 1,) the fixes move further than the wheels, or much less, beyond their noise.
+def _contradicted(wheels: WheelSamples, begin: Ints, fixes: Fixes) -> Bools:
+    """Return in which intervals (k,) the fixes move further than the wheels, or much less, beyond their noise.
 
     In a gap the robot may drive along an arc, so that the chord is shorter than the distance. The difference of the
     sides gives the turn of this arc.
+
+    Parameters
+    ----------
+    begin : (k,) samples at which the intervals begin
     """
-    stamps = wheels.stamp_ns
     if len(fixes.stamp_ns) < 2:
-        return np.zeros(len(stamps) - 1, np.bool_)
-    seconds = np.diff(stamps) / 1e9
-    left, right = wheels.v_left_mps[:-1] * seconds, wheels.v_right_mps[:-1] * seconds
+        return np.zeros(len(begin), np.bool_)
+    stamps = wheels.stamp_ns[np.stack([begin, begin + 1])]
+    seconds = (stamps[1] - stamps[0]) / 1e9
+    left, right = wheels.v_left_mps[begin] * seconds, wheels.v_right_mps[begin] * seconds
     at = [np.interp(stamps, fixes.stamp_ns, axis) for axis in (fixes.north_m, fixes.east_m)]
-    chord = np.hypot(*(np.diff(axis) for axis in at))
-    after = np.clip(np.searchsorted(fixes.stamp_ns, stamps), 1, len(fixes.stamp_ns) - 1)
-    seen = np.minimum(np.abs(fixes.stamp_ns[after] - stamps), np.abs(stamps - fixes.stamp_ns[after - 1])) < 10**9
+    chord = np.hypot(*(after - before for before, after in at))
+    next_fix = np.clip(np.searchsorted(fixes.stamp_ns, stamps), 1, len(fixes.stamp_ns) - 1)
+    to_next, since_last = np.abs(fixes.stamp_ns[next_fix] - stamps), np.abs(stamps - fixes.stamp_ns[next_fix - 1])
+    seen = (np.minimum(to_next, since_last) < 10**9).all(axis=0)
     along, across = np.abs(left + right) / 2, np.abs(left - right) / 2
     noise = CONTRADICTED_SIGMAS * math.sqrt(2.0 * float(np.median(fixes.var_north_m2 + fixes.var_east_m2)))
     slack = CONTRADICTED_SHARE * np.maximum(along, across) + noise
     apart = (chord > along + across + slack) | ((along > chord + across + slack) & (along > 2.0 * chord + noise))
-    return np.asarray(apart & seen[:-1] & seen[1:])
+    return np.asarray(apart & seen)
 
 
 def bridge_gaps(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[WheelSamples, Note | None]:
@@ -127,8 +132,11 @@ def bridge_gaps(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[Wheel
     usual = float(np.median(interval)) if len(interval) else math.inf
     steps = np.ones(len(wheels.stamp_ns), np.int64)
     filled = (interval > gap_s) & (interval <= LONGEST_BRIDGE_S) & (interval >= 2.0 * usual)
-    filled &= ~np.isin(wheels.stamp_ns[:-1], wheels.restarts_ns) & ~_contradicted(wheels, fixes)
-    if not (wheels.from_position and filled.any()):
+    gaps = np.flatnonzero(filled)
+    if not (wheels.from_position and len(gaps)):
+        return wheels, None
+    filled[gaps] = ~np.isin(wheels.stamp_ns[gaps], wheels.restarts_ns) & ~_contradicted(wheels, gaps, fixes)
+    if not filled.any():
         return wheels, None
     steps[:-1][filled] = np.round(interval[filled] / usual).astype(np.int64)
     row = np.repeat(np.arange(len(steps)), steps)

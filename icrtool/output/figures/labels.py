@@ -67,7 +67,8 @@ def write_labels(
     axes.apply_aspect()
     point_px, frame = axes.figure.dpi / 72.0, axes.bbox
     step = PATH_STEP_PT * point_px
-    drawn = [axes.transData.transform(np.column_stack([x, y])) for x, y in paths]
+    # one path after the other: the pixels of all points of a long path are as large as two columns of the log
+    drawn = (axes.transData.transform(np.column_stack([x, y])) for x, y in paths)
     crossed = np.concatenate([np.empty((0, 2)), *(_along(path, step) for path in drawn)])
     spots = axes.transData.transform(
         np.array([*((label.x, label.y) for label in labels), *marks], np.float64).reshape(-1, 2)
