@@ -121,7 +121,7 @@ OTHER_CONVENTION = note(
 OF_THE_SENSE = {"heading_convention_contradicts", "heading_convention_corrected"}
 """Codes of findings about the sense of a heading. The offset is stated in the same finding."""
 
-ONE_DIRECTION = 0.8
+SHARED_DIRECTION = 0.8
 """Mean resultant length of angles above which they have one direction."""
 
 TURNED_ABOUT_SHARE = 0.8
@@ -183,7 +183,7 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
     turns_about = False
     if min(len(ahead), len(back)) >= FEWEST_ALIGNMENT_WINDOWS:
         about = (back * np.conj(ahead.mean())).real < 0.0
-        turns_about = abs(ahead.mean()) > ONE_DIRECTION and float(about.mean()) > TURNED_ABOUT_SHARE
+        turns_about = abs(ahead.mean()) > SHARED_DIRECTION and float(about.mean()) > TURNED_ABOUT_SHARE
     agreement, mirrored_agreement = float(abs(angle.mean())), float(abs(turned_over.mean()))
     return CourseComparison(
         len(angle), agreement, mirrored_agreement, bool(turns_about), float(np.median(lasted_s[moved]))
@@ -315,7 +315,7 @@ def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseCo
 
     A heading of the other convention that the configuration keeps also scatters. It is used, with a warning.
     """
-    if fit is not None and fit.heading_scatter > UNEXPLAINED_RAD and not course.mirrored_agreement > ONE_DIRECTION:
+    if fit is not None and fit.heading_scatter > UNEXPLAINED_RAD and not course.mirrored_agreement > SHARED_DIRECTION:
         spread = min(math.degrees(fit.heading_scatter), 180.0)
         tried = f"with ENU, NED and any offset it scatters by {spread:.0f}° ({len(fit.windows.begin)} windows)"
         raise _no_heading(log, "does not follow the course over ground", tried)
