@@ -7,9 +7,11 @@ servers redirect to. The library of the provider finds the credentials.
 from __future__ import annotations
 
 import logging
+import os
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any, TypeVar
 
@@ -44,6 +46,12 @@ _FAILURES = (
 )  # fmt: skip
 """Module and name of the errors that libraries raise in addition to OSError."""
 
+_UNREACHED = (("aiohttp", "ClientConnectionError"), ("azure.core.exceptions", "ServiceRequestError"))
+"""Module and name of the errors without any answer of a host."""
+
+_SLOW_TO_GIVE_UP = frozenset({"gs", "gcs", "az", "abfs", "abfss"})
+"""Schemes whose libraries have no setting that ends the requests to a dead host."""
+
 _READ_BYTES = 1 << 16
 """Number of bytes of a page that are read at a time."""
 
@@ -69,10 +77,52 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
         # `url_to_fs` of fsspec is not used, because it follows chains with ::, even after a question mark.
         address = path.scheme + path.url[len(path.scheme) :]
         settings = ask_server(path, lambda: {**kind._get_kwargs_from_urls(address), **_patience(path.scheme)})  # noqa: SLF001 - as it does
-        found: tuple[Any, str] = ask_server(path, lambda: (kind(**settings), kind._strip_protocol(address)))  # noqa: SLF001
+        inner: str = ask_server(path, lambda: kind._strip_protocol(address))  # noqa: SLF001
+        if path.scheme in _SLOW_TO_GIVE_UP:
+            stated, bucket = tuple(sorted(settings.items())), inner.partition("/")[0]
+            files = ask_server(path, lambda: _answering_store(kind, stated, bucket, os.getpid()))
+        else:
+            files = ask_server(path, lambda: kind(**settings))
     except (KeyError, IndexError, TypeError, AttributeError, NotImplementedError) as err:
         raise LogError(path, "is no address that can be read", type(err).__name__) from None
-    return found
+    return files, inner
+
+
+@cache
+def _answering_store(kind: Any, settings: tuple[tuple[str, Any], ...], bucket: str, process: int) -> Any:  # noqa: ANN401, ARG001 - of a library; connections belong to a process
+    """Return the file system of a store whose host has answered a first question within `server_timeout_s`.
+
+    Notes
+    -----
+    The libraries look for credentials and repeat requests to a dead host for 20 to 85 s, and have no setting for that.
+    A later request to a store that answered is repeated as they do.
+
+    Raises
+    ------
+    TimeoutError
+        The host does not answer in time.
+    """
+    answers: list[tuple[Any, Exception | None]] = []
+
+    def ask() -> None:
+        files = None
+        try:
+            files = kind(**dict(settings), skip_instance_cache=True)
+            files.exists(bucket)
+        except Exception as err:  # noqa: BLE001 - it is looked at in the thread of the caller
+            answers.append((files, err))
+        else:
+            answers.append((files, None))
+
+    asking = threading.Thread(target=ask, daemon=True)
+    asking.start()
+    asking.join(server_timeout_s())
+    if not answers:
+        raise TimeoutError
+    files, err = answers[0]
+    if err is not None and (files is None or isinstance(err, _classes(_UNREACHED))):
+        raise err
+    return files  # a host that refuses to tell of its bucket may give a file
 
 
 def _patience(scheme: str) -> dict[str, Any]:
@@ -223,5 +273,10 @@ def _words_of(cause: BaseException, path: UrlPath) -> str:
 
 def _failures() -> tuple[type[Exception], ...]:
     """Return the errors of a broken connection or a refused request."""
-    loaded = [getattr(sys.modules.get(module), name, None) for module, name in _FAILURES]
-    return (OSError, ValueError, *(one for one in loaded if one is not None))
+    return (OSError, ValueError, *_classes(_FAILURES))
+
+
+def _classes(named: Iterable[tuple[str, str]]) -> tuple[type[Exception], ...]:
+    """Return classes of errors, of those modules that are loaded."""
+    loaded = [getattr(sys.modules.get(module), name, None) for module, name in named]
+    return tuple(one for one in loaded if one is not None)

@@ -40,6 +40,9 @@ _PROBE, _CLAIM = ".icrtool-upload", ".icrtool-writer"
 can be written. `_CLAIM` exists during an upload and states the command that uploads: no other command then changes the
 address."""
 
+_ANNOUNCEMENT = f"{_CLAIM}-"
+"""Begin of the names of files that announce a claim, at a store without conditional writes."""
+
 CLAIM_CHECKED_S = 60.0
 """Time after which a command reads the claim again before it uploads a further file [s]. The claim must still be its
 own."""
@@ -92,9 +95,7 @@ def folder_on_disk(
         return
     store = _Store(place, "written" if writes else "read")
     if writes:
-        # An address that cannot be written is refused before any work is done for it.
-        store.put(b"icrtool", _PROBE)
-        store.remove([_PROBE])
+        store.probe()
     scratch = ScratchFolder()
     folder = scratch.path / (place.name or "results")
     try:
@@ -162,6 +163,14 @@ class _Store:
         self._name = self._name.rstrip("/")
         self._found: list[object] = []
         self._checked_s = 0.0
+        self._is_conditional = False
+
+    def probe(self) -> None:
+        """Write and remove a file: a place that cannot be written is refused before any work is done for it."""
+        self.put(b"icrtool", _PROBE)
+        # Some stores refuse conditions, others ignore them.
+        self._is_conditional = self._create(b"icrtool", _PROBE) == errno.EEXIST
+        self.remove([_PROBE])
 
     def put(self, content: bytes, name: str = "") -> None:
         """Write a file of this name below the address, or at the address itself."""
@@ -181,7 +190,7 @@ class _Store:
             # A stranger may have written the name, so a name that leads out of the folder is left out.
             path = PurePosixPath(name)
             below = name and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
-            if below and name not in {_PROBE, _CLAIM}:
+            if below and name not in {_PROBE, _CLAIM} and not name.startswith(_ANNOUNCEMENT):
                 names.append(name)
         with place_errors(self._place):
             for name in names:
@@ -229,35 +238,85 @@ class _Store:
     def _take_claim(self) -> bytes:
         """Write a claim to the address, unless another command that still runs has written one; return the claim.
 
-        The object store lets only one of several commands write the claim. The other commands end before they have
-        changed anything.
+        Of several commands only one can write the claim: all others end before they changed anything. The store itself
+        sees to that; at a store without conditional writes, commands announce their claims.
 
         Raises
         ------
         OutputError
             Another command is writing there.
         """
-        claim = f"{writer_id()} {time.time():.0f}".encode()
-        if not self._write_claim(claim):
-            other = self._read_claim()
-            if not _is_abandoned(other):
-                minutes = max(time.time() - _time_of(other), 0.0) / 60
-                why = f"another command has been writing there for {minutes:.0f} min"
-                advice = f"its results stay; wait for its end, or remove {_CLAIM} there where it was killed"
-                raise OutputError(self._place, why, advice)
-            self.remove([_CLAIM])
-            if not self._write_claim(claim):
-                self._raise_claimed()
-        # A store without conditional writes lets the second command replace the first claim.
+        stated, time_s = writer_id(), f"{time.time():.0f}"
+        claim = f"{stated} {time_s}".encode()
+        if self._is_conditional:
+            self._write_claim(claim)
+        else:
+            with self._announced(f"{_ANNOUNCEMENT}{stated}-{time_s}"):
+                self._write_claim(claim)
         self._check_claim(claim)
         return claim
 
-    def _write_claim(self, claim: bytes) -> bool:
-        """Write the claim if there is none; return whether it was written."""
+    @contextmanager
+    def _announced(self, own: str) -> Iterator[None]:
+        """Announce a claim while it is written; refuse to go on where another command announces one.
 
-        def write(**options: str) -> int:
+        Notes
+        -----
+        Each command writes an announcement under a name of its own, and then lists all names. Of two commands, the one
+        that wrote its announcement later finds the announcement of the other, or its claim, and ends. Both end if both
+        announcements were written before both lists.
+        """
+        self.put(b"icrtool", own)
+        try:
+            self._files.invalidate_cache()
+            names = [name.rpartition("/")[2] for name in self._ask(self._list_top_files)]
+            others = [name for name in names if name.startswith(_ANNOUNCEMENT) and name != own]
+            for name in others:
+                stated, _, time_s = name.removeprefix(_ANNOUNCEMENT).rpartition("-")
+                self._refuse_writer(f"{stated} {time_s}".encode())
+            self.remove(others)
+            yield
+        finally:
+            self.remove([own])
+
+    def _write_claim(self, claim: bytes) -> None:
+        """Write a claim, in the place of none or of an abandoned one."""
+        if other := self._read_claim():
+            self._refuse_writer(other)
+            self.remove([_CLAIM])
+        answer = self._create(claim, _CLAIM)
+        if answer == errno.EEXIST:
+            self._refuse_writer(self._read_claim())
+            self._raise_claimed()
+        if answer == errno.ENOSYS:
+            self.put(claim, _CLAIM)
+
+    def _refuse_writer(self, claim: bytes) -> None:
+        """Refuse to write where another command's claim lies that is not abandoned.
+
+        Raises
+        ------
+        OutputError
+            Such a claim lies there.
+        """
+        if claim and not _is_abandoned(claim):
+            minutes = max(time.time() - _time_of(claim), 0.0) / 60
+            why = f"another command has been writing there for {minutes:.0f} min"
+            advice = f"its results stay; wait for its end, or remove {_CLAIM} there where it was killed"
+            raise OutputError(self._place, why, advice)
+
+    def _create(self, content: bytes, name: str) -> int:
+        """Write a file if the store finds none of its name.
+
+        Returns
+        -------
+        int
+            0; EEXIST if there is one; ENOSYS if the store refuses conditions.
+        """
+
+        def write() -> int:
             try:
-                self._files.pipe_file(self._address_of(_CLAIM), claim, **options)
+                self._files.pipe_file(self._address_of(name), content, mode="create")
             except OSError as err:
                 if isinstance(err, FileExistsError) or err.errno in (errno.EINVAL, errno.EBUSY):
                     return errno.EEXIST
@@ -266,9 +325,7 @@ class _Store:
                 return errno.ENOSYS
             return 0
 
-        answer = self._ask(lambda: write(mode="create"))
-        # Some stores have no conditional writes.
-        return not (self._ask(write) if answer == errno.ENOSYS else answer)
+        return self._ask(write)
 
     def _read_claim(self) -> bytes:
         """Return the claim at the address; empty if there is none."""

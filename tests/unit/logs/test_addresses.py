@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import re
 import shutil
 import socket
@@ -28,6 +29,7 @@ from icrtool.records.input_limits import MOST_BYTES, SERVER_TIMEOUT_S, most_byte
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.samples import InputFile
 from support.scripts import load_script
+from support.servers import AnsweringHandler, web_server
 
 SECRET = "d0ntPr1ntTh1s"
 FORMS = {
@@ -292,6 +294,71 @@ def test_a_server_whose_header_does_not_end_is_given_up(kind: str, name: str, mo
     ):
         read(UrlPath(url.replace("a.mcap", name)))
     assert time.monotonic() - began < 15.0
+
+
+STORES = {
+    "gs": ("gcsfs", {"STORAGE_EMULATOR_HOST": "http://127.0.0.1:{port}", "NO_GCE_CHECK": "true"}),
+    "az": (
+        "adlfs",
+        {
+            "AZURE_STORAGE_CONNECTION_STRING": "DefaultEndpointsProtocol=http;AccountName=a;AccountKey=a2V5;"
+            "BlobEndpoint=http://127.0.0.1:{port}/a;"
+        },
+    ),
+}
+"""By scheme, the library, and what a user sets for a store on this machine."""
+
+
+def set_store(scheme: str, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have addresses of a scheme lead to a port of this machine, for 0.5 s without an answer."""
+    library, variables = STORES[scheme]
+    pytest.importorskip(library, reason="needs the extra icrtool[cloud]")
+    connection._answering_store.cache_clear()
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value.format(port=port))
+    monkeypatch.setenv(SERVER_TIMEOUT_S, "0.5")
+
+
+@pytest.mark.parametrize("read", [open_log, find_logs_at], ids=["a file", "a pattern"])
+@pytest.mark.parametrize("scheme", STORES)
+def test_an_object_store_whose_host_is_dead_is_given_up(
+    scheme: str, read: Callable[[UrlPath], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their libraries repeat requests for 35 s and more."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        set_store(scheme, free.getsockname()[1], monkeypatch)
+    began = time.monotonic()
+    with pytest.raises(LogError, match=r"sent nothing for 0\.5 s"):
+        read(UrlPath(f"{scheme}://box/{'a' if read is open_log else '*'}.mcap"))
+    assert time.monotonic() - began < 10.0
+
+
+@pytest.mark.parametrize("status", [200, 403])
+def test_an_object_store_that_answers_is_read_also_where_it_tells_nothing_of_its_bucket(
+    status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = (Path(__file__).parents[3] / "sample_logs" / "wheeled_lawnmower.mcap").read_bytes()
+    about = {"kind": "storage#object", "name": "a.mcap", "bucket": "box", "size": str(len(content)), "generation": "7"}
+    asked = []
+
+    class Bucket(AnsweringHandler):
+        def answer(self, *, body: bool) -> None:
+            asked.append(self.path)
+            first, last = map(int, self.headers.get("Range", "bytes=0-0")[6:].split("-"))
+            is_file, is_content = "/o/a.mcap" in self.path, "alt=media" in self.path
+            found = content[first : last + 1] if is_content else json.dumps(about).encode()
+            self.send_response(206 if is_content else 200 if is_file else status)
+            self.send_header("Content-Length", str(len(found)))
+            self.end_headers()
+            self.wfile.write(found)
+
+    with web_server(Bucket) as server:
+        set_store("gs", server.server_port, monkeypatch)
+        monkeypatch.setenv(SERVER_TIMEOUT_S, "15")
+        with contextlib.closing(open_log(UrlPath("gs://box/a.mcap"))) as container:
+            assert container.channels
+    assert "/o/" not in asked[0]
+    connection._answering_store.cache_clear()
 
 
 NO_ANSWERS = {

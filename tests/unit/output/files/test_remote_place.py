@@ -7,11 +7,15 @@ import functools
 import hashlib
 import json
 import os
+import queue
+import random
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -392,22 +396,97 @@ def test_a_claim_of_a_living_command_is_named_and_one_of_a_dead_command_is_repla
             assert ".icrtool-writer" not in names(store, "runs/one/")
 
 
-def test_a_store_without_conditional_writes_is_written_all_the_same(store, monkeypatch, capfd, mcap):
+@pytest.fixture(params=["refused", "ignored"])
+def conditions(request, monkeypatch):
+    """A store that refuses conditional writes, or writes whatever their condition is."""
     import s3fs
+
+    if request.param == "kept":
+        return request.param
 
     put = s3fs.S3FileSystem._pipe_file
 
     async def without(self, path, data, *given, mode="overwrite", **named):
-        if mode == "create":
+        if mode == "create" and request.param == "refused":
             raise OSError(errno.ENOSYS, "A header you provided implies functionality that is not implemented.")
         return await put(self, path, data, *given, **named)
 
     monkeypatch.setattr(s3fs.S3FileSystem, "_pipe_file", without)
+    return request.param
+
+
+@pytest.mark.usefixtures("conditions")
+def test_a_store_without_conditional_writes_is_written_all_the_same(store, monkeypatch, capfd, mcap):
     status, said = run(monkeypatch, capfd, *fit_command(mcap))
     assert status == 0, said
     config = icrtool.load_config(robot=ROBOT[1])
     expected = icrtool.fit(icrtool.read_log(mcap, config), config)
     assert len(icrtool.open_run("s3://field/runs/one").states) == len(expected.states)
+    assert not [name for name in names(store) if ".icrtool-writer" in name]
+
+
+def claim_of(place: str, uploads: list[str], is_conditional: bool) -> Iterator[str]:
+    """Claim a place step by step: a step is a request; `uploads` gets the place where the claim succeeds."""
+    claiming = remote_place._Store(UrlPath(place))
+    claiming._is_conditional = is_conditional
+    turns, steps = queue.Queue(), queue.Queue()
+
+    def in_turn(request):
+        steps.put("request")
+        turns.get()
+        return remote_place._Store._ask(claiming, request)
+
+    def work():
+        turns.get()
+        try:
+            claiming._take_claim()
+            uploads.append(place)
+        except OutputError:
+            pass
+        steps.put("end")
+
+    claiming._ask = in_turn
+    threading.Thread(target=work, daemon=True).start()
+    while True:
+        turns.put(None)
+        if steps.get() == "end":
+            return
+        yield place
+
+
+@pytest.mark.parametrize("conditions", ["kept", "refused", "ignored"], indirect=True)
+@pytest.mark.parametrize("seed", range(8))
+def test_of_two_commands_that_claim_a_place_in_the_same_moment_one_at_most_uploads(
+    store, conditions, monkeypatch, seed
+):
+    """The requests of both come in any order."""
+    monkeypatch.setattr(remote_place, "_is_abandoned", lambda claim: not claim)
+    rng, uploads = random.Random(seed), []
+    both = [claim_of("s3://field/runs/one", uploads, conditions == "kept") for _ in range(2)]
+    while both:
+        turn = rng.choice(both)
+        if next(turn, None) is None:
+            both.remove(turn)
+    assert len(uploads) <= 1
+    assert uploads or conditions != "kept"
+    assert (".icrtool-writer" in names(store, "runs/one/")) is bool(uploads)
+    assert not [name for name in names(store, "runs/one/") if name.startswith(".icrtool-writer-")]
+
+
+@pytest.mark.usefixtures("conditions")
+def test_an_announcement_of_a_dead_command_is_removed_and_that_of_a_living_one_is_named(
+    store, monkeypatch, capfd, mcap
+):
+    now = int(time.time())
+    old, new = f".icrtool-writer-0123abcd-1-0123abcd-{now - 7200}", f".icrtool-writer-0123abcd-1-0123abcd-{now - 60}"
+    store.client.put_object(Bucket="field", Key=f"runs/one/{old}", Body=b"icrtool")
+    assert run(monkeypatch, capfd, *fit_command(mcap))[0] == 0
+    assert old not in names(store, "runs/one/")
+    store.client.put_object(Bucket="field", Key=f"runs/one/{new}", Body=b"icrtool")
+    status, said = run(monkeypatch, capfd, *fit_command(mcap), "--smooth", "--overwrite")
+    assert status == 1
+    assert "another command has been writing there for 1 min" in said
+    assert "smoothed.csv" not in names(store, "runs/one/")
 
 
 def test_a_claim_that_another_command_took_after_an_hour_is_seen_between_files(store, monkeypatch, capfd, mcap):
