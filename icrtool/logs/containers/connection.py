@@ -122,7 +122,7 @@ def _answering_store(kind: Any, settings: tuple[tuple[str, Any], ...], bucket: s
     files, err = answers[0]
     if err is not None and (files is None or isinstance(err, _classes(_UNREACHED))):
         raise err
-    return files  # a host that refuses to tell of its bucket may give a file
+    return files  # a host that refuses to describe its bucket may give a file
 
 
 def _patience(scheme: str) -> dict[str, Any]:

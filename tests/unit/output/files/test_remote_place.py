@@ -455,7 +455,7 @@ def claim_of(place: str, uploads: list[str], is_conditional: bool) -> Iterator[s
 
 
 @pytest.mark.parametrize("conditions", ["kept", "refused", "ignored"], indirect=True)
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(5))
 def test_of_two_commands_that_claim_a_place_in_the_same_moment_one_at_most_uploads(
     store, conditions, monkeypatch, seed
 ):
@@ -474,6 +474,7 @@ def test_of_two_commands_that_claim_a_place_in_the_same_moment_one_at_most_uploa
 
 
 @pytest.mark.usefixtures("conditions")
+@pytest.mark.parametrize("conditions", ["refused"], indirect=True)
 def test_an_announcement_of_a_dead_command_is_removed_and_that_of_a_living_one_is_named(
     store, monkeypatch, capfd, mcap
 ):
