@@ -158,9 +158,9 @@ def _page_of(source: Path) -> str:
     if is_special(source):
         raise errors.RunError(source, NOT_REGULAR, SAVE_IT)
     if not source.exists():
-        advice = "name a log, or what icrtool fit, batch, compare -o or calibrate -o wrote"
+        advice = "name a log, or a result of icrtool fit, batch, compare -o or calibrate -o"
         raise errors.RunError(source, "no such file or directory", advice)
-    why = "no run, fleet, comparison or calibration in it"
+    why = "holds no run, fleet, comparison or calibration"
     raise errors.RunError(source, why, "icrtool fit, batch, compare and calibrate -o make one")
 
 

@@ -227,15 +227,15 @@ def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple
     begins = sorted(float(t) for t in at_s) if at_s else _spaced(run, length_s)
     for begin in begins:
         if not 0 <= begin <= last - length_s:
-            why = f"{length_s:g} s from {begin:g} s on do not fit"
+            why = f"an outage of {length_s:g} s at {begin:g} s does not fit into the drive"
             raise ConfigError("outage", why, f"the drive lasts {last:.1f} s")
     for begin, following in pairwise(begins):
         if begin + length_s >= following:
-            why = f"{length_s:g} s from {begin:g} s on reach into the one at {following:g} s"
-            raise ConfigError("outage", why, "the filter must learn between two outages: place them further apart")
+            why = f"the outage of {length_s:g} s at {begin:g} s reaches the next outage, at {following:g} s"
+            raise ConfigError("outage", why, "place them further apart, so that the filter learns between them")
     for begin in np.array(begins)[_meets(np.array(begins), length_s, _own_outages_s(run))]:
-        why = f"{length_s:g} s from {begin:g} s on lie in an outage of the log's own"
-        raise ConfigError("outage", why, "there is no estimate to compare it with: choose another time")
+        why = f"the outage of {length_s:g} s at {begin:g} s overlaps an outage of the log itself"
+        raise ConfigError("outage", why, "choose another time, because there is no estimate to compare with")
     origin = int(run.table.stamp_ns[0])
     return tuple((origin + round(t * 1e9), origin + round((t + length_s) * 1e9)) for t in begins)
 

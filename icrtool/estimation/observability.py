@@ -293,7 +293,7 @@ def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[
         if name != "x_icr_m" and side * final[name] <= AT_LIMIT * least_icr_m:
             reasons[name] = f"stopped at the limit of {side * least_icr_m:+z.2f} m that the filter keeps"
         elif std > WEAK_SHARE * width:
-            reasons[name] = f"± {std:.2f} m, by how much stretches of the drive differ"
+            reasons[name] = f"± {std:.2f} m, from the differences between stretches of the drive"
     return reasons
 
 

@@ -241,7 +241,7 @@ def test_a_calibration_of_another_width_is_refused_for_the_page_of_a_finished_ru
 ) -> None:
     status, _, errors = icrtool("report", run_directory, "--calibration", other)
     assert status == 1
-    assert "robot.track_width_m: is 0.6 m, and 0.61 m in the calibration" in errors
+    assert "robot.track_width_m: is 0.6 m, and 0.555 m in the calibration" in errors
     assert not (run_directory / "report.html").exists()
 
 

@@ -205,10 +205,10 @@ def _settings(summary: RunDocument) -> list[Section]:
     for name, finding in summary.alignment.items():
         value, applied = plus_minus(finding.value, finding.std, 4, ""), plus_minus(finding.applied or None, None, 4, "")
         alignment.append((name, value, applied, finding.why))
-    caption = "Alignment of the streams: what was found and corrected"
+    caption = "Alignment of the streams: findings and corrections"
     stream_blocks.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
     return [
-        Section("Why these streams, and what was found of them", stream_blocks, PAGE),
+        Section("Reasons for these streams, and findings about them", stream_blocks, PAGE),
         Section("Configuration that the run was made with", [Line(format_settings(summary.config), "as is")], PAGE),
     ]
 
