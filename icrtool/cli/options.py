@@ -44,9 +44,14 @@ if TYPE_CHECKING:
     from icrtool.records.requests import FitRequest, ReportRequest
 
 Command = Callable[..., Any]
+"""The function of a command."""
+
 Option = Callable[[Command], Command]
+"""A decorator that adds an option to a command."""
+
 Record = TypeVar("Record")
 Change = Callable[[Record], Record]
+"""A function that returns a changed record."""
 
 REQUESTS_MODULE = "icrtool.records.requests"
 """Name of the module of the records that are made from options. It is imported when a command is called."""
@@ -70,7 +75,10 @@ METRES_OF_UNIT = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 """Metres in each unit of length that a user may type."""
 
 POSITIVE = _Positive(min=0, min_open=True)
+"""Numbers above 0."""
+
 NOT_NEGATIVE = click.FloatRange(min=0)
+"""Numbers from 0 on."""
 
 
 USUAL_OPTIONS = (
@@ -344,9 +352,16 @@ CUT = option_group(
 """--from and --to, as `start` and `end`."""
 
 AS_JSON = flag("--json as_json", "Print one JSON document on standard output, and nothing else there.")
+"""Option of commands that print JSON."""
+
 QUIET_RESULTS = flag("-q --quiet", "Print no results.")
+"""Option of commands without warnings."""
+
 QUIET = flag("-q --quiet", "Print no results and no warnings.")
+"""Option of commands with warnings."""
+
 VERBOSE_OPTION = flag("-v --verbose", "Print more details.")
+"""Option for details."""
 
 
 def printer_options(*options: Option) -> Option:
@@ -357,6 +372,7 @@ def printer_options(*options: Option) -> Option:
 SEED = option(
     "--seed", None, click.IntRange(min=0), "Seed of all noise; the same seed gives the same numbers.", default=0
 )
+"""Option for the seed of all random numbers."""
 
 
 def plot_formats(text: str) -> tuple[str, ...]:
@@ -391,6 +407,7 @@ CALIBRATION_OPTIONS = option_group(
 )  # fmt: skip
 """--calibration as `calibrations`, and --refit-sensors; `calibrations_of` reads the files."""
 ALLOW_UNUSABLE = flag("--allow-unusable", "Also give the distances and numbers of runs that are not usable.")
+"""Option for runs that are not usable."""
 
 
 def _split_gates(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:

@@ -47,6 +47,7 @@ class OdometryPath:
 
 
 OdometryName = Literal["icr", "icr_momentary", "no_slip"]
+"""Name of a path that is computed from wheel speeds alone."""
 
 
 def momentary_icrs(table: States) -> FrozenIcrs:

@@ -13,6 +13,7 @@ Rows = NDArray[np.int32]
 Complexes = NDArray[np.complex128]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
+"""Types of arrays."""
 
 
 def trapezoids(t: Floats, rate: Floats) -> Floats:

@@ -350,7 +350,7 @@ class FittedModel:
 
 
 class Lever(NamedTuple):
-    """Which parts of the lever from the body's origin to the measured position are known: ahead, and to the right.
+    """The known parts of the lever from the body's origin to the measured position: ahead, and to the right.
 
     An unknown part has the same effect as ICRs off centre. It is a constant of the log, not an error of a controller.
     """
@@ -360,6 +360,7 @@ class Lever(NamedTuple):
 
 
 NO_LEVER = Lever()
+"""No part of the lever is known."""
 
 
 def controller_model(five: FittedModel, lever: Lever, width_m: float) -> FittedModel:

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
 
 Subject = Literal["run", "report", "fleet", "comparison"]
+"""Kind of the subject of a figure."""
+
 Parts = Mapping[str, tuple[float, ...]]
+"""Further arguments of a figure's function, by suffix of the file name."""
 
 HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
 """Distances of the histograms [m], as in Figs. 28 to 30 of Pentzer 2014."""

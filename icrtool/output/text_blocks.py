@@ -30,7 +30,10 @@ NARROWEST, NARROWEST_LAST = 8, 12
 """Smallest width of a shortened cell of text in a table that is too wide, and of a wrapped last column [characters]."""
 
 Look = Literal["title", "good", "bad", "as is"]
+"""Look of a line."""
+
 Grade = Literal["good", "care", "bad", "fact"]
+"""Grade of a check."""
 
 BRIEF, VERBOSE, PAGE = 0, 1, 2
 """Depth of a section: always shown; with -v, and folded on a page; only on a page."""
@@ -194,6 +197,7 @@ Block = str | Title | Line | Table | Facts | Checks | Items | Figure | Section
 """Any block. A `str` is a sentence; its lines after the first are indented by two more characters."""
 
 Printed = str | Line | Table
+"""Parts of a document that are printed."""
 
 
 def filled_blocks(blocks: Iterable[Block]) -> Iterator[Block]:

@@ -24,6 +24,7 @@ IDEAL = Sensors(wheels="ideal", heading_resolution_rad=0.0)
 """Sensors whose wheel speeds have no error."""
 
 Column = Floats | Ints | list[float | str]
+"""A column of the CSV of a study, or of its settings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +151,7 @@ def statistics(values: Floats) -> dict[str, float]:
 Statistic = Literal[
     "spread", "median", "mean", "percent", "percent found", "range of means", "extreme medians", "first"
 ]
+"""Name of a computation of numbers from levels."""
 
 STATISTICS: dict[Statistic, Callable[[Sequence[Floats]], tuple[float, ...]]] = {
     "spread": lambda levels: _percentiles(np.concatenate(levels)),

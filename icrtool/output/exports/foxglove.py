@@ -66,6 +66,7 @@ ICRS_TYPE, ERROR_TYPE, EVENT_TYPE = (
     "icrtool_msgs/msg/OpenLoopError",
     "icrtool_msgs/msg/Event",
 )
+"""Names of icrtool's own message types."""
 
 _ICR_FIELDS = "".join(
     f"float64 {name}\nfloat64 std_{name}\nfloat64 {name[:-2]}_minus_std_m\nfloat64 {name[:-2]}_plus_std_m\n"

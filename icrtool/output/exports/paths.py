@@ -35,6 +35,7 @@ from icrtool.records.tables import States
 from icrtool.records.text import distance_text
 
 PathName = Literal["filter", "smoothed"] | OdometryName
+"""Name of a path of a run."""
 
 ERROR_HORIZON_M = 10.0
 """Distance after which open-loop errors are exported [m]."""
@@ -75,7 +76,7 @@ class ExportPath:
 
 
 class Globe(NamedTuple):
-    """Where the origin of the local plane is: latitude and longitude [deg], WGS 84, height above the ellipsoid [m]."""
+    """The place of the origin of the local plane: latitude and longitude [deg], WGS 84, height above the ellipsoid [m]."""
 
     latitude_deg: float
     longitude_deg: float

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Subject_contra = TypeVar("Subject_contra", contravariant=True)
 
 Share = bool | Literal["all", "row", "col"]
-"""Which panels have one scale, as in ``matplotlib.figure.Figure.subplots``."""
+"""The panels that have a common scale, as in ``matplotlib.figure.Figure.subplots``."""
 
 Grid = NDArray[Any]
 """Axes (rows, columns)."""

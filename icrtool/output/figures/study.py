@@ -274,14 +274,23 @@ def draw_coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> 
 
 
 SETTLING_LINES: Draw = partial(draw_columns, columns=_looks_by_icr("settle_{icr}_s"))
+"""Draws the settling time of each ICR."""
+
 MEANS, SCATTER = (
     partial(draw_columns, columns=_looks_by_icr(f"{statistic}_{{icr}}_m")) for statistic in ("mean", "scatter")
 )
+"""Draw mean and scatter of each ICR."""
+
 RMS: Draw = partial(draw_columns, columns=_looks_by_icr("rms_{icr}_m"), log="xy")
+"""Draws the rms error of each ICR."""
+
 WITHOUT_GNSS: Draw = partial(
     draw_columns, columns={"blind_icr_10m_p95_m": OPEN_LOOP, "blind_no_slip_10m_p95_m": OPEN_LOOP_NO_SLIP}, log="xy"
 )
+"""Draws the errors after 10 m without GNSS."""
+
 NOT_INFLATED, INFLATED = (partial(draw_estimates, value=value) for value in ("not inflated", "inflated"))
+"""Draw the estimates without and with inflation."""
 
 STUDY_PICTURES: dict[str, tuple[tuple[str, Draw], ...]] = {
     "convergence": (("ICR estimate [m]", draw_estimates), ("Runs [%]", draw_shares)),

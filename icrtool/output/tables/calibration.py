@@ -394,7 +394,7 @@ def transfer_blocks(comparison: documents.GroupComparison) -> list[Block]:
 
 
 class Change(NamedTuple):
-    """Whether the errors of two groups differ, in words.
+    """The difference of the errors of two groups, in words.
 
     Attributes
     ----------

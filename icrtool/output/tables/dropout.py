@@ -60,6 +60,7 @@ from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
 ReachRow = tuple[str, str, str, str]
+"""Name of a row, distance on this drive, distance on the next drive, and note."""
 
 NEXT_DRIVE = "next drive, 9 of 10"
 NEXT_DRIVE_MEANS = "next drive: this robot, this kind of ground"
