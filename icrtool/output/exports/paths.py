@@ -76,7 +76,7 @@ class ExportPath:
 
 
 class Globe(NamedTuple):
-    """The place of the origin of the local plane: latitude and longitude [deg], WGS 84, height above the ellipsoid [m]."""
+    """Origin of the local plane: latitude and longitude [deg], WGS 84, height above the ellipsoid [m]."""
 
     latitude_deg: float
     longitude_deg: float
