@@ -63,7 +63,7 @@ def open_loop_rows(table: Table, hours: float, repeats: int) -> None:
     def intervals() -> None:
         for h, horizon in enumerate(HORIZONS_M):
             blocks, p95 = cut_blocks(ends[:, h] >= 0, drive.distance, horizon), float(summary.p95[h])
-            ranked = RankedTrials.of(errors[:, h])
+            ranked = RankedTrials.from_errors(errors[:, h])
             sums = block_sums(errors[:, h], blocks, ranked, float(summary.p50[h]), p95)
             error_intervals(errors[:, h], blocks, sums, float(summary.p50[h]), p95, GIVEN_SPREAD)
 

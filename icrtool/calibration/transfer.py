@@ -172,7 +172,7 @@ def _sum_up(
     errors_m: Floats, path_m: Floats, horizon_m: float
 ) -> tuple[documents.ErrorsAt, statistics.BlockSums | None]:
     """Return p95 and mean [m] of trials (k,) of one horizon with their intervals, and the sums of blocks of path."""
-    ranked = statistics.RankedTrials.of(errors_m)
+    ranked = statistics.RankedTrials.from_errors(errors_m)
     _, expected, p50, p95, _ = ranked.summary()
     blocks = statistics.cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
     sums = statistics.block_sums(errors_m, blocks, ranked, p50, p95)

@@ -204,7 +204,7 @@ def report_on(
     check_type(run, Run, MAKE_RUN)
     watch("outages and examples")
     limits = [report.parse_gate(gate) for gate in request.gates]
-    runs = _Runs.of(run, request)
+    runs = _Runs.from_request(run, request)
     plans = _outage_plans(runs.filtered, request)
     scored = _scored_topics(request, log)
     forced = [outage for plan in plans for outage in shown_paths.force_outages(runs.filtered, plan)]
@@ -276,7 +276,7 @@ class _Runs(NamedTuple):
     compared: Run
 
     @classmethod
-    def of(cls, run: Run, request: ReportRequest) -> _Runs:
+    def from_request(cls, run: Run, request: ReportRequest) -> _Runs:
         """Return the forms of a run for a request.
 
         Raises

@@ -110,14 +110,14 @@ def measure_errors(
         each = pool.map if at_once > TRIAL_THREADS else map
         for columns in [slice(begin, begin + at_once) for begin in range(0, len(horizons), at_once)]:
             group, ends = horizons[columns], counted_ends(track, horizons[columns], starts).T
-            trials = _StartedTrials.of(run, track, group, ends)
+            trials = _StartedTrials.from_all_states(run, track, group, ends)
             for number, (model, of_few, rows) in enumerate(
                 zip(predictors, sparse_errors, by_model, strict=True), start=1
             ):
                 watch(f"errors, row {number} of {len(predictors)}")
                 if is_compared := isinstance(model, ComparedRow):
                     errors = of_few.position[:, columns]
-                    tried = trials.at(sparse, group, errors)
+                    tried = trials.from_starts(sparse, group, errors)
                 else:
                     errors, tried = _errors(track, model, ends, pool), trials
                 rows.extend(_statistics(model, group, errors, of_few, columns, tried, each))
@@ -190,12 +190,12 @@ class _StartedTrials(NamedTuple):
     slipping: list[Bools | None]
 
     @classmethod
-    def of(cls, run: Run, track: Track, horizons_m: Floats, ends: Rows) -> _StartedTrials:
+    def from_all_states(cls, run: Run, track: Track, horizons_m: Floats, ends: Rows) -> _StartedTrials:
         """Return the trials from all states; `ends` (h, n) has the states at which they end."""
         blocks = _blocks(track.distance, horizons_m, (column >= 0 for column in ends))
         return cls(track.distance, blocks, _slipping_trials(run, ends))
 
-    def at(self, starts: Ints, horizons_m: Floats, errors: Floats) -> _StartedTrials:
+    def from_starts(self, starts: Ints, horizons_m: Floats, errors: Floats) -> _StartedTrials:
         """Return the trials from starts (k,), which have errors (k, h)."""
         path_m = self.path_m[starts]
         slipping = [None if touches is None else touches[starts] for touches in self.slipping]
@@ -305,7 +305,7 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
 
 def _row(metres: float, errors: Floats) -> documents.ErrorRow:
     """Return the statistics of errors (n,) [m] at one horizon [m]."""
-    trials, *numbers = statistics.RankedTrials.of(errors).summary()
+    trials, *numbers = statistics.RankedTrials.from_errors(errors).summary()
     return documents.ErrorRow(metres, trials, *map(finite_or_none, numbers))
 
 
@@ -343,7 +343,7 @@ def _at_horizon(
     blocks : blocks of path of the trials
     slipping : (n,) whether a trial touches a slip event
     """
-    ranked = statistics.RankedTrials.of(errors)
+    ranked = statistics.RankedTrials.from_errors(errors)
     trials, expected, p50, p95, largest = ranked.summary()
     # The width of the bins shows most trials in detail in spite of outliers, with at most some hundred bins.
     shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
@@ -351,7 +351,7 @@ def _at_horizon(
     sums = statistics.block_sums(errors, blocks, ranked, p50, p95)
     del ranked  # A column of the log is freed before the intervals need a column of the same size.
     intervals = statistics.error_intervals(errors, blocks, sums, p50, p95, spread)
-    _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.of(np.degrees(turned)).summary()
+    _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.from_errors(np.degrees(turned)).summary()
     shares = 100.0 * expected / metres, 100.0 * p95 / metres
     numbers = (expected, p50, p95, largest, *shares, *intervals, turn_mean, turn_p95)
     row = documents.SummaryRow(metres, trials, *(finite_or_none(float(number)) for number in numbers))
@@ -363,7 +363,7 @@ def _aligned(errors: Floats, blocks: statistics.Blocks | None) -> documents.Alig
     """Return the statistics of errors (n,) [m] with aligned start headings; None without such errors."""
     if not np.isfinite(errors).any():
         return None
-    ranked = statistics.RankedTrials.of(errors)
+    ranked = statistics.RankedTrials.from_errors(errors)
     _, expected, p50, p95, _ = ranked.summary()
     return documents.AlignedErrors(expected, p95, statistics.block_sums(errors, blocks, ranked, p50, p95))
 

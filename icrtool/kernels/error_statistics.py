@@ -378,8 +378,8 @@ class RankedTrials(NamedTuple):
     before: Ints
 
     @classmethod
-    def of(cls, errors_m: Floats) -> RankedTrials:
-        """Return the trials in errors (n,) [m], which are NaN for a start without a trial."""
+    def from_errors(cls, errors_m: Floats) -> RankedTrials:
+        """Return the ranked trials of errors (n,) [m], which are NaN for a start without a trial."""
         trials = errors_m[~np.isnan(errors_m)]
         cell, counts = count_cells(trials, trials.max(initial=0.0) / PERCENTILE_CELLS or 1.0)
         return cls(trials, cell, np.append(0, np.cumsum(counts)))
@@ -424,7 +424,7 @@ def error_summary(errors_m: Floats) -> Summary:
     Pentzer 2014, Section 6.4. The paper computes the expected error from a histogram, which gives the mean if bins are
     narrow. Percentiles interpolate linearly between order statistics, as ``numpy.percentile`` does.
     """
-    columns = [RankedTrials.of(column).summary() for column in errors_m.T]
+    columns = [RankedTrials.from_errors(column).summary() for column in errors_m.T]
     trials, *numbers = np.array(columns).reshape(-1, len(Summary._fields)).T
     return Summary(trials.astype(np.int64), *numbers)
 

@@ -48,7 +48,7 @@ def moving_sums(rng: np.random.Generator, starts: int) -> np.ndarray:
 def sums_of(errors: np.ndarray) -> tuple[BlockSums, dict[str, float]]:
     blocks = cut_blocks(np.isfinite(errors), np.arange(len(errors), dtype=float), float(HORIZON))
     summary = error_summary(errors[:, np.newaxis])
-    found = block_sums(errors, blocks, RankedTrials.of(errors), float(summary.p50[0]), float(summary.p95[0]))
+    found = block_sums(errors, blocks, RankedTrials.from_errors(errors), float(summary.p50[0]), float(summary.p95[0]))
     assert found is not None
     return found, {"expected": float(summary.expected[0]), "p50": float(summary.p50[0]), "p95": float(summary.p95[0])}
 
@@ -61,7 +61,7 @@ def test_block_sums_are_sums() -> None:
     assert found.above_p95.sum() == np.count_nonzero(errors > numbers["p95"])
     for metric in numbers:
         assert abs(found.influence(metric).sum()) < 1e-3
-    assert block_sums(errors, None, RankedTrials.of(errors), 1.0, 2.0) is None
+    assert block_sums(errors, None, RankedTrials.from_errors(errors), 1.0, 2.0) is None
 
 
 @pytest.mark.parametrize(("metric", "least"), [("expected", 0.90), ("p50", 0.90), ("p95", 0.88)])

@@ -51,7 +51,7 @@ def errors_along(path_blocks, rng, wander_m=0.0):
 
 
 def interval_of(errors, path, horizon=1.0, spread=STEADY):
-    blocks, ranked = cut_blocks(~np.isnan(errors), path, horizon), RankedTrials.of(errors)
+    blocks, ranked = cut_blocks(~np.isnan(errors), path, horizon), RankedTrials.from_errors(errors)
     _, _, p50, p95, _ = ranked.summary()
     return error_intervals(errors, blocks, block_sums(errors, blocks, ranked, p50, p95), p50, p95, spread)
 
@@ -76,7 +76,7 @@ class TestSummary:
         rng = np.random.default_rng(1)
         errors = scale * np.floor(20.0 * rng.exponential(size=500))  # many alike
         for some in (errors, np.append(errors, 1e6 * scale), errors[:1], errors[:2]):
-            ranked = RankedTrials.of(some)
+            ranked = RankedTrials.from_errors(some)
             for share in (0.0, 0.05, 0.5, 0.95, 1.0, *rng.random(9)):
                 assert ranked.quantile(share) == pytest.approx(np.quantile(some, share), rel=1e-14, abs=0.0)
 
@@ -196,13 +196,13 @@ class TestIntervals:
 class TestHistogram:
     def test_is_percent_of_the_trials_per_bin(self):
         errors = np.array([0.0, 0.05, 0.1, 0.25, np.nan, 0.31])
-        bins = RankedTrials.of(errors).histogram(0.1)
+        bins = RankedTrials.from_errors(errors).histogram(0.1)
         np.testing.assert_allclose(bins.left, [0.0, 0.1, 0.2, 0.3])
         np.testing.assert_allclose(bins.right, [0.1, 0.2, 0.3, 0.4])
         np.testing.assert_allclose(bins.percent, [40.0, 20.0, 20.0, 20.0])
 
     def test_of_no_trial_is_empty(self):
-        assert len(RankedTrials.of(np.array([np.nan])).histogram(0.1).percent) == 0
+        assert len(RankedTrials.from_errors(np.array([np.nan])).histogram(0.1).percent) == 0
 
     @pytest.mark.parametrize(
         ("largest", "width"), [(0.0, 0.01), (math.nan, 0.01), (0.5, 0.01), (0.51, 0.02), (12.0, 0.5), (49.0, 1.0)]
@@ -212,7 +212,7 @@ class TestHistogram:
 
     def test_expected_error_is_the_mean_of_the_histogram_as_bins_narrow(self):
         errors = np.random.default_rng(0).exponential(size=5000)
-        bins = RankedTrials.of(errors).histogram(0.001)
+        bins = RankedTrials.from_errors(errors).histogram(0.001)
         middle = 0.5 * (bins.left + bins.right)
         assert np.sum(middle * bins.percent) / 100.0 == pytest.approx(errors.mean(), abs=0.0005)
 
