@@ -26,13 +26,15 @@ class SlidingBody(NamedTuple):
 
     Attributes
     ----------
-    mass : [kg]; inertia : about the vertical axis through the centre of mass [kg m^2]
-    mass_forward, mass_right, mass_height : centre of mass, ahead and right of the body origin, above the ground [m]
-    slip, creep : sliding speed at which friction is 0.7 of its limit: while a track stands [m/s], and its growth with
-        the track speed
-    lateral : friction sideways over friction along the track
-    resistance : rolling resistance over load
-    lag : time constant of the motors [s]; 0: none
+    mass : mass of the robot [kg]
+    inertia : moment of inertia about the vertical axis through the centre of mass [kg m^2]
+    mass_forward, mass_right, mass_height : position of the centre of mass: ahead and to the right of the body origin,
+        and above the ground [m]
+    slip : sliding speed at which friction is 0.7 of its limit while a track stands [m/s]
+    creep : growth of this sliding speed with the track speed
+    lateral : ratio of the friction sideways to the friction along the track
+    resistance : ratio of the rolling resistance to the load
+    lag : time constant of the motors [s]; 0: no lag
     steering : turn rate commanded for a heading error [1/s]
     largest_turn : largest turn rate that the driver commands [rad/s]
     y_right, y_left : ICRs by which the driver turns velocities into track speeds [m]
