@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from icrtool.dropout_analysis.dropout_report import dropout_report
-from icrtool.dropout_analysis.report import best_row
+from icrtool.dropout_analysis.report import DropoutReport, best_row
 from icrtool.records.run import Run
 
 
@@ -17,8 +17,12 @@ def run(make_run: Callable[..., Run]) -> Run:
     return make_run(duration_s=60.0)
 
 
-def test_it_has_the_smallest_expected_error_at_10_m_and_no_gyro(run: Run) -> None:
-    report = dropout_report(run, horizons_m=[5.0, 10.0])
+@pytest.fixture(scope="module")
+def report(run: Run) -> DropoutReport:
+    return dropout_report(run, horizons_m=[5.0, 10.0])
+
+
+def test_it_has_the_smallest_expected_error_at_10_m_and_no_gyro(report: DropoutReport) -> None:
     best = best_row(report)
     assert best is not None
     assert best.horizon_m == 10.0
@@ -32,16 +36,15 @@ def test_it_has_the_smallest_expected_error_at_10_m_and_no_gyro(run: Run) -> Non
     assert report.document.best == best
 
 
-def test_no_slip_is_not_as_good_for_a_robot_that_slips(run: Run) -> None:
-    best = best_row(dropout_report(run, horizons_m=[5.0, 10.0]))
+def test_no_slip_is_not_as_good_for_a_robot_that_slips(report: DropoutReport) -> None:
+    best = best_row(report)
     assert best is not None
     assert best.as_good == ()
 
 
 def test_a_row_whose_interval_lies_apart_is_worse_however_wide_the_difference_is(
-    run: Run, monkeypatch: pytest.MonkeyPatch
+    report: DropoutReport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    report = dropout_report(run, horizons_m=[5.0, 10.0])
     no_slip, first = report.result("no_slip"), best_row(report)
     assert no_slip is not None
     assert first is not None

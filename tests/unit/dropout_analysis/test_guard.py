@@ -77,7 +77,7 @@ def test_the_report_of_such_a_run_states_no_distance_and_fails_its_limits(
 ) -> None:
     why = "recommended has only 4 trials of 10 m"
     monkeypatch.setattr("icrtool.dropout_analysis.dropout_report.why_unusable", lambda *_: note("few_trials", why))
-    found = dropout_report(run, gates=["recommended.p95@10m <= 100"])
+    found = dropout_report(run, horizons_m=[5.0, 10.0], gates=["recommended.p95@10m <= 100"])
     assert (found.document.usable, found.document.unusable_because) == (False, why)
     assert found.document.budgets == ()
     assert found.document.recommended is None
@@ -85,7 +85,7 @@ def test_the_report_of_such_a_run_states_no_distance_and_fails_its_limits(
     printed = format_dropout(found)
     assert printed.startswith(f"Do not use: {why}")
     assert "How far within" not in printed
-    allowed = dropout_report(run, gates=["recommended.p95@10m <= 100"], allow_unusable=True)
+    allowed = dropout_report(run, horizons_m=[5.0, 10.0], gates=["recommended.p95@10m <= 100"], allow_unusable=True)
     assert allowed.passed
     assert not allowed.document.usable
 

@@ -139,15 +139,31 @@ def test_malformed_machine_code_with_the_right_digest_is_not_run(place: Path) ->
     assert done.returncode == 0
 
 
-@pytest.mark.parametrize("what", ["file", "folder"])
-def test_machine_code_that_everybody_may_write_is_not_run(place: Path, what: str) -> None:
-    [file] = place.iterdir()
-    open_to_all = file if what == "file" else place
-    open_to_all.chmod(0o777)
-    assert called(place) == ["1.5", "1", "True"]
-    file.chmod(0o644)
-    place.chmod(0o700)
-    assert called(place) == ["1.5", "0", "False"]
+CALL_OPEN_TO_ALL = """
+import sys
+from pathlib import Path
+import numpy as np
+from icrtool.kernels.compiled import njit
+from icrtool.kernels.kinematics import lag
+place = Path(sys.argv[1])
+[file] = place.iterdir()
+for of_file, of_place in ((0o644, 0o700), (0o777, 0o700), (0o644, 0o777), (0o644, 0o700)):
+    file.chmod(of_file)
+    place.chmod(of_place)
+    kernel, speed = njit(lag.py_func), np.array([1.0, 2.0, 2.0])
+    kernel(speed, np.array([1.0, 0.5]))
+    print(speed[2], kernel.compiled, flush=True)
+"""
+
+
+def test_machine_code_that_everybody_may_write_is_not_run(place: Path) -> None:
+    """Neither a file nor a folder that is open to all; as soon as both are the owner's again, it is."""
+    done = subprocess.run(
+        [sys.executable, "-c", CALL_OPEN_TO_ALL, str(place)], env={**os.environ, "NUMBA_CACHE_DIR": str(place)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == ["1.5 0", "1.5 1", "1.5 1", "1.5 0"], done.stderr
+    assert done.returncode == 0
 
 
 @pytest.mark.parametrize(

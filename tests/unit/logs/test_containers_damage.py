@@ -140,8 +140,9 @@ def test_mcap_cut_off_anywhere_gives_what_stands_before_the_cut(tmp_path, compre
     path = tmp_path / "cut.mcap"
     for length in [
         *range(1, 120, 13),
-        *range(120, data_end, 797),
-        *range(data_end - 12, data_end + 30),
+        *range(120, data_end, 1597),
+        *range(data_end - 12, data_end + 12),
+        *range(data_end + 12, data_end + 30, 3),
         len(whole) - 1,
     ]:
         path.write_bytes(whole[:length])

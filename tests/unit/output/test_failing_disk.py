@@ -56,7 +56,7 @@ def calibration(run: Run) -> Calibration:
 
 @pytest.fixture(scope="module")
 def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
-    report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0])
+    report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0], ladder=False)
     study = small_study("rate")
     table = calibration
 

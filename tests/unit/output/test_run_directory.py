@@ -121,7 +121,7 @@ def test_a_list_of_sums_of_60_megabytes_is_refused_unread(tmp_path: Path) -> Non
 def test_the_list_of_a_run_names_its_report_too_and_is_true_at_every_moment(written: Path, run: Run) -> None:
     files = set(names_in(written)) - {"B2SUMS"}
     assert listed(written) == files
-    report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0])
+    report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0], ladder=False)
     report.write(written / "dropout", plots=("png",))
     first = listed(written)
     assert first == set(names_in(written)) - {"B2SUMS"}
@@ -141,7 +141,7 @@ def test_the_list_of_a_run_names_its_report_too_and_is_true_at_every_moment(writ
 
 def test_a_list_beside_a_report_that_is_no_run_is_left_alone(tmp_path: Path, run: Run) -> None:
     (tmp_path / "B2SUMS").write_text("my own list of dropout/report.json\n")
-    icrtool.dropout_report(run, horizons_m=[1.0]).write(tmp_path / "dropout", plots=())
+    icrtool.dropout_report(run, horizons_m=[1.0], ladder=False).write(tmp_path / "dropout", plots=())
     assert (tmp_path / "B2SUMS").read_text() == "my own list of dropout/report.json\n"
 
 
@@ -191,7 +191,7 @@ def test_a_run_with_a_file_of_somebody_is_left_alone_whatever_is_asked(written: 
 
 
 def test_a_run_and_a_report_that_were_damaged_are_made_again(written: Path, run: Run) -> None:
-    report = icrtool.dropout_report(run, horizons_m=[1.0])
+    report = icrtool.dropout_report(run, horizons_m=[1.0], ladder=False)
     report.write(written / "dropout", plots=())
     (written / "dropout" / "report.json").write_text("{")
     report.write(written / "dropout", plots=())
