@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,7 +43,7 @@ class Drive(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message as it is logged."""
+    """A message as it is logged; its content may be encoded already."""
 
     log_ns: int
     topic: str
@@ -139,9 +139,23 @@ def numbers(
         yield Message(stamp_ns, topic, f"std_msgs/msg/{kind}", made(f"std_msgs/msg/{kind}", data=value))
 
 
+_references: dict[int, tuple[Drive, list[Message]]] = {}
+
+
+def reference(drive: Drive) -> list[Message]:
+    """Return `fixes` and `imus` of a drive, encoded once for all logs of this drive: encoding takes longest."""
+    if id(drive) not in _references:
+        messages = [
+            one._replace(content=bytes(STORE.serialize_cdr(one.content, one.kind)))
+            for one in (*fixes(drive), *imus(drive))
+        ]
+        _references[id(drive)] = drive, messages  # a drive that is kept keeps its id
+    return _references[id(drive)][1]
+
+
 def write_messages(
     path: Path,
-    *streams: Iterator[Message],
+    *streams: Iterable[Message],
     definitions: Mapping[str, str] | Callable[[str], str] | None = None,
 ) -> Path:
     """Write an MCAP file.
@@ -164,6 +178,7 @@ def write_messages(
                     text = definitions.get(kind, text)
                 schema = writer.register_schema(kind, "ros2msg", text.encode())
                 channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channels[topic, kind], log_ns, bytes(STORE.serialize_cdr(content, kind)), log_ns)
+            data = content if isinstance(content, bytes) else bytes(STORE.serialize_cdr(content, kind))
+            writer.add_message(channels[topic, kind], log_ns, data, log_ns)
         writer.finish()
     return path

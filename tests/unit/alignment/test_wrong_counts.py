@@ -13,8 +13,9 @@ from icrtool.logs.read_log import read_log
 from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from support.drives import ICRS
-from support.field_logs import RADIUS_M, ROBOT, WIDTH_M, fixes, imus, joint_states, make_drive, write_messages
+from support.field_logs import RADIUS_M, ROBOT, WIDTH_M, joint_states, make_drive, reference, write_messages
 
+DRIVE = make_drive(100.0)
 MULTIPLIER = (ICRS[0] - ICRS[1]) / WIDTH_M
 REPORTED = (2.0, 0.1, 0.3)
 """Factors of the radius for which the rows of a report are looked at: too large, too small, corrected by the scales of
@@ -23,9 +24,8 @@ the configuration."""
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    drive = make_drive(100.0)
     where = tmp_path_factory.mktemp("radius") / "drive.mcap"
-    return write_messages(where, joint_states(drive), fixes(drive), imus(drive))
+    return write_messages(where, joint_states(DRIVE), reference(DRIVE))
 
 
 def fitted(path: Path, *sets: str) -> Run:
@@ -84,14 +84,14 @@ def test_every_row_sees_wheels_that_were_corrected(path: Path, radius: float, se
     [(0.8, 40.0, 0.0), (0.8, 70.0, -3.0), (2.0, 40.0, -3.0), (2.0, 70.0, 0.0), (4.5, 40.0, 0.0), (4.5, 70.0, -3.0)],
 )
 def test_a_base_that_restarts_leaves_a_gap(tmp_path: Path, gap_s: float, at_s: float, begins: float) -> None:
-    drive = make_drive(100.0)
+    drive = DRIVE
     t = (drive.stamp_ns - drive.stamp_ns[0]) / 1e9
     kept = (t < at_s) | (t >= at_s + gap_s)
     first = int(np.searchsorted(t, at_s + gap_s))
     angles = (np.where(t >= at_s + gap_s, side - side[first] + begins, side) for side in (drive.left, drive.right))
     left, right = angles
     wheels = replace_columns(drive._replace(left=left, right=right), kept)
-    path = write_messages(tmp_path / "restart.mcap", joint_states(wheels), fixes(drive), imus(drive))
+    path = write_messages(tmp_path / "restart.mcap", joint_states(wheels), reference(DRIVE))
     config = load_config(sets=ROBOT)
     run = fit(read_log(path, config), config)
     whole = float(np.hypot(np.diff(drive.north), np.diff(drive.east)).sum())
@@ -110,14 +110,14 @@ def replace_columns(drive, kept):  # type: ignore[no-untyped-def]
 
 
 def test_a_gap_in_which_the_fixes_contradict_the_wheels_is_not_bridged(tmp_path: Path) -> None:
-    drive = make_drive(100.0)
+    drive = DRIVE
     t = (drive.stamp_ns - drive.stamp_ns[0]) / 1e9
     kept = (t < 50.0) | (t >= 53.0)
     # no faster than elsewhere, yet not what the fixes show
     back = [np.where(t >= 53.0, side - 0.9 * (side[1060] - side[1000]), side) for side in (drive.left, drive.right)]
     for sides, bridged in ((back, False), ([drive.left, drive.right], True)):
         wheels = replace_columns(drive._replace(left=sides[0], right=sides[1]), kept)
-        path = write_messages(tmp_path / "gap.mcap", joint_states(wheels), fixes(drive), imus(drive))
+        path = write_messages(tmp_path / "gap.mcap", joint_states(wheels), reference(DRIVE))
         config = load_config(sets=ROBOT)
         found = [one.code for one in fit(read_log(path, config), config).document.notes]
         assert ("wheel_gaps_bridged" in found) is bridged

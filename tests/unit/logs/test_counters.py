@@ -12,7 +12,7 @@ import icrtool
 from icrtool.config import load_config
 from icrtool.logs.read_log import read_log
 from icrtool.logs.streams.counters import find_modulus, unwrap_counter
-from support.field_logs import ROBOT, Drive, Message, fixes, imus, make_drive, numbers, write_messages
+from support.field_logs import ROBOT, Drive, Message, make_drive, numbers, reference, write_messages
 
 DRIVE = make_drive(60.0)
 
@@ -93,7 +93,7 @@ def test_a_pair_of_topics_with_wrapping_counters_gives_the_speeds_of_the_wheels(
     left, right = (
         wrapped(np.floor(side * per_rad), modulus, low).astype(np.int64) for side in (DRIVE.left, DRIVE.right)
     )
-    path = write_messages(tmp_path / "log.mcap", *pair(DRIVE, kind, left, right), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", *pair(DRIVE, kind, left, right), reference(DRIVE))
     log = read_log(path, load_config(sets=ROBOT))
     step = 1.0 / per_rad / np.diff(DRIVE.stamp_ns[:2])[0] * 1e9
     np.testing.assert_allclose(log.wheels.left[:-1] / per_rad, DRIVE.left_radps[:-1], atol=step)
@@ -104,7 +104,7 @@ def test_a_pair_of_topics_with_wrapping_counters_gives_the_speeds_of_the_wheels(
 @pytest.mark.parametrize("turn", [360.0, 2 * np.pi])
 def test_a_pair_of_topics_with_angles_within_a_turn_is_in_radians(tmp_path: Path, turn: float) -> None:
     left, right = (wrapped(side * turn / (2 * np.pi), turn) for side in (DRIVE.left, DRIVE.right))
-    path = write_messages(tmp_path / "log.mcap", *pair(DRIVE, "Float64", left, right), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", *pair(DRIVE, "Float64", left, right), reference(DRIVE))
     log = read_log(path, load_config(sets=ROBOT))
     assert log.wheels.unit == "rad"
     np.testing.assert_allclose(log.wheels.left[:-1], DRIVE.left_radps[:-1], rtol=1e-6)
@@ -115,7 +115,7 @@ def test_lamps_of_both_sides_are_no_wheels(tmp_path: Path) -> None:
         on = np.arange(len(DRIVE.stamp_ns)) % 256
         return [one for side in ("left", "right") for one in numbers(f"/{side}_lamp", "UInt8", DRIVE.stamp_ns, on)]
 
-    path = write_messages(tmp_path / "log.mcap", iter(lamps()), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", iter(lamps()), reference(DRIVE))
     with pytest.raises(icrtool.IcrToolError, match="no wheels found"):
         read_log(path, load_config(sets=ROBOT))
 

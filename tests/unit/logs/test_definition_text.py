@@ -16,7 +16,7 @@ from icrtool.logs.messages.definition_text import SEPARATOR, plain_definition
 from icrtool.logs.messages.definitions import definition_note, ros_definitions
 from icrtool.logs.read_log import read_log, survey_log
 from icrtool.records.text import LogText
-from support.field_logs import ROBOT, fixes, imus, joint_states, make_drive, write_messages
+from support.field_logs import ROBOT, joint_states, make_drive, reference, write_messages
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -110,7 +110,7 @@ def test_why_a_definition_is_not_read_names_its_line() -> None:
 )
 def test_a_bundled_type_with_a_damaged_definition_is_read_and_named(tmp_path: Path, text: str) -> None:
     damaged = {"sensor_msgs/msg/JointState": text}
-    path = write_messages(tmp_path / "log.mcap", joint_states(DRIVE), fixes(DRIVE), imus(DRIVE), definitions=damaged)
+    path = write_messages(tmp_path / "log.mcap", joint_states(DRIVE), reference(DRIVE), definitions=damaged)
     log = read_log(path, load_config(sets=ROBOT))
     np.testing.assert_allclose(log.wheels.left[:-1], DRIVE.left_radps[:-1], rtol=1e-6)
     (warning,) = (one for one in log.warnings if "bundled definition" in one)
@@ -124,7 +124,7 @@ def test_a_ros1_connection_without_a_definition_uses_the_bundled_one() -> None:
 
 
 def test_a_log_recorded_on_windows_is_read_as_any_other(tmp_path: Path) -> None:
-    streams = joint_states(DRIVE), fixes(DRIVE), imus(DRIVE)
+    streams = joint_states(DRIVE), reference(DRIVE)
     path = write_messages(tmp_path / "log.mcap", *streams, definitions=WRITTEN["byte order mark and CRLF"])
     log = read_log(path, load_config(sets=ROBOT))
     np.testing.assert_allclose(log.wheels.right[:-1], DRIVE.right_radps[:-1], rtol=1e-6)

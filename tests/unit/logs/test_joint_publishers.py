@@ -16,12 +16,11 @@ from support.field_logs import (
     ROBOT,
     Drive,
     Message,
-    fixes,
     header,
-    imus,
     joint_states,
     made,
     make_drive,
+    reference,
     write_messages,
 )
 
@@ -62,7 +61,7 @@ def test_zeros_of_a_second_publisher_are_left_out_and_named(
 ) -> None:
     others = zeros(DRIVE, every_ns, speeds=speeds, late_ns=late_ns)
     log = read_log(
-        write_messages(tmp_path / "log.mcap", joint_states(DRIVE), others, fixes(DRIVE), imus(DRIVE)),
+        write_messages(tmp_path / "log.mcap", joint_states(DRIVE), others, reference(DRIVE)),
         load_config(sets=ROBOT),
     )
     rows = np.searchsorted(DRIVE.stamp_ns, log.wheels.stamp_ns[:-1])
@@ -96,7 +95,7 @@ def test_a_state_that_a_second_publisher_repeats_is_left_out(
             DRIVE.stamp_ns.tolist(), DRIVE.left, DRIVE.right, DRIVE.left_radps, DRIVE.right_radps, strict=True
         )
     ]
-    path = write_messages(tmp_path / "log.mcap", own, others, fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", own, others, reference(DRIVE))
     log = read_log(path, load_config(sets=ROBOT))
     rows = np.searchsorted(DRIVE.stamp_ns, log.wheels.stamp_ns[:-1])
     assert len(rows) > 0.97 * len(DRIVE.stamp_ns)
@@ -110,7 +109,7 @@ def test_speeds_of_an_encoder_with_few_counts_have_no_second_publisher(tmp_path:
     sides = (np.round(side / 0.5) * 0.5 for side in (DRIVE.left_radps, DRIVE.right_radps))
     left, right = (side + 0.5 * (np.arange(len(side)) % 3 == 0) for side in sides)
     drive = DRIVE._replace(left_radps=left, right_radps=right)
-    path = write_messages(tmp_path / "log.mcap", joint_states(drive), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", joint_states(drive), reference(DRIVE))
     log = read_log(path, load_config(sets=(*ROBOT, "wheels.quantity=velocity")))
     assert len(log.wheels.stamp_ns) == len(DRIVE.stamp_ns)
     assert not log.warnings
@@ -120,7 +119,7 @@ def test_a_robot_that_stops_often_has_no_second_publisher(tmp_path: Path) -> Non
     """Speeds alone, 0 for a second every four seconds."""
     stops = np.where(np.arange(len(DRIVE.stamp_ns)) % 80 < 20, 0.0, 1.0)
     drive = DRIVE._replace(left_radps=DRIVE.left_radps * stops, right_radps=DRIVE.right_radps * stops)
-    path = write_messages(tmp_path / "log.mcap", joint_states(drive), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", joint_states(drive), reference(DRIVE))
     log = read_log(path, load_config(sets=(*ROBOT, "wheels.quantity=velocity")))
     assert len(log.wheels.stamp_ns) == len(DRIVE.stamp_ns)
     assert not log.warnings
@@ -129,9 +128,7 @@ def test_a_robot_that_stops_often_has_no_second_publisher(tmp_path: Path) -> Non
 @pytest.mark.parametrize("wheels", [1, 2])
 @pytest.mark.parametrize("late_ns", [0, 2_000_000, 25_000_000])
 def test_positions_of_wheels_in_messages_of_their_own_are_joined(tmp_path: Path, wheels: int, late_ns: int) -> None:
-    path = write_messages(
-        tmp_path / "log.mcap", apart(DRIVE, wheels, late_ns, quantity="pv"), fixes(DRIVE), imus(DRIVE)
-    )
+    path = write_messages(tmp_path / "log.mcap", apart(DRIVE, wheels, late_ns, quantity="pv"), reference(DRIVE))
     log = read_log(path, load_config(sets=ROBOT))
     rows = np.searchsorted(DRIVE.stamp_ns, log.wheels.stamp_ns[:-1])
     assert len(rows) > 0.98 * len(DRIVE.stamp_ns)
@@ -141,7 +138,7 @@ def test_positions_of_wheels_in_messages_of_their_own_are_joined(tmp_path: Path,
 
 
 def test_speeds_of_sides_in_messages_of_their_own_are_held(tmp_path: Path) -> None:
-    path = write_messages(tmp_path / "log.mcap", apart(DRIVE, 1, 2_000_000, quantity="v"), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", apart(DRIVE, 1, 2_000_000, quantity="v"), reference(DRIVE))
     log = read_log(path, load_config(sets=ROBOT))
     np.testing.assert_allclose(log.wheels.right, DRIVE.right_radps[: len(log.wheels.right)], rtol=1e-9)
 

@@ -25,6 +25,7 @@ from support.field_logs import (
     made,
     make_drive,
     numbers,
+    reference,
     write_messages,
 )
 
@@ -73,7 +74,7 @@ def test_headers_of_two_clocks_are_not_used_together(tmp_path: Path) -> None:
 
 def test_header_stamps_that_a_stream_lacks_are_refused_with_the_key(tmp_path: Path) -> None:
     sides = (numbers(f"/{side}_speed", "Float64", DRIVE.stamp_ns, DRIVE.left_radps) for side in ("left", "right"))
-    path = write_messages(tmp_path / "log.mcap", *sides, fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", *sides, reference(DRIVE))
     with pytest.raises(ConfigError, match=r"topics.clock: .* has no header stamps"):
         read_log(path, load_config(sets=(*ROBOT, "topics.clock=header")))
 
@@ -111,7 +112,7 @@ def test_wheel_speeds_without_header_are_in_the_configured_unit(
 
 
 def test_positions_have_no_rpm(tmp_path: Path) -> None:
-    path = write_messages(tmp_path / "log.mcap", joint_states(DRIVE), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", joint_states(DRIVE), reference(DRIVE))
     with pytest.raises(ConfigError, match=r"wheels.unit: /joint_states holds positions"):
         read_log(path, load_config(sets=(*ROBOT, "wheels.unit=rpm")))
 
@@ -160,7 +161,7 @@ def own_twists(drive: Drive, width_m: float) -> Iterator[Message]:
 
 
 def test_a_body_twist_in_fields_that_are_named_gives_the_wheels(tmp_path: Path) -> None:
-    path = write_messages(tmp_path / "log.mcap", own_twists(DRIVE, 1.0), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", own_twists(DRIVE, 1.0), reference(DRIVE))
     config = load_config(sets=(*ROBOT, *KEYS_OF_TWIST, "wheels.twist_width_m=1.0"))
     log = read_log(path, config)
     np.testing.assert_allclose(log.wheels.v_left_mps, DRIVE.left_radps * RADIUS_M, atol=1e-12)
@@ -182,6 +183,6 @@ def test_a_body_twist_in_fields_that_are_named_gives_the_wheels(tmp_path: Path) 
 def test_a_wrong_field_of_a_body_twist_is_refused_with_its_key(
     tmp_path: Path, sets: tuple[str, ...], words: str
 ) -> None:
-    path = write_messages(tmp_path / "log.mcap", own_twists(DRIVE, 1.0), fixes(DRIVE), imus(DRIVE))
+    path = write_messages(tmp_path / "log.mcap", own_twists(DRIVE, 1.0), reference(DRIVE))
     with pytest.raises(ConfigError, match=words):
         read_log(path, load_config(sets=(*ROBOT, *sets)))
