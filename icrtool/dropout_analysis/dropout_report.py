@@ -3,55 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-import numpy as np
-from msgspec import UNSET
-from msgspec.structs import astuple
 
-from icrtool import __version__
-from icrtool.calibration.calibration_rows import calibrated_drive
-from icrtool.calibration.other_grounds import other_ground_ends
-from icrtool.calibration.pooled import turning_recording_of
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, compare_models, with_poses_of
+from icrtool.calibration.run_models import Model
 from icrtool.dropout_analysis import report, shown_paths
 from icrtool.dropout_analysis.guard import why_unusable
+from icrtool.dropout_analysis.report_document import ReportParts, complete_report, with_other_grounds
 from icrtool.dropout_analysis.starts import split_by_turning, with_smoothed_reference
-from icrtool.dropout_analysis.topic_rows import topic_rows
+from icrtool.dropout_analysis.tested_rows import TestedRows, tested_rows
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
-from icrtool.errors import ConfigError, DataError
-from icrtool.estimation.odometry import measured_headings
-from icrtool.kernels.error_statistics import (
-    FEWEST_PATH_BLOCKS,
-    HORIZONS_A_BLOCK,
-    LEVEL,
-    MOST_PATH_BLOCKS,
-    NEXT_LEVEL,
-)
-from icrtool.kernels.open_loop import TOLERANCE_M
+from icrtool.errors import ConfigError
 from icrtool.logs.topic_poses import read_topic_poses
-from icrtool.motion.models import RECOMMENDED
-from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import DEFAULT_SEED, BudgetDistance, Gate, Verdict
-from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.choices import Reference, Starts
-from icrtool.records.dropout_document import TurningSplit, UsedCalibration
-from icrtool.records.notes import Note, warnings_of
-from icrtool.records.plain_data import plain_value
+from icrtool.records.dropout_document import UsedCalibration
+from icrtool.records.notes import Note
 from icrtool.records.requests import ReportRequest
-from icrtool.records.rows import TOPIC_ROW, kind_of, turned_by
-from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
+from icrtool.records.run import MAKE_RUN, Run, check_type
 from icrtool.records.stages import Watch, unwatched
-from icrtool.records.text import distance_text
 from icrtool.records.topic_poses import TopicPoses
-
-ERROR_FIELDS = len(documents.ErrorRow.__struct_fields__)
-"""Number of fields of `ErrorRow`, which are the first fields of `SummaryRow`."""
 
 
 def dropout(
@@ -104,7 +80,7 @@ def dropout(
     )  # fmt: skip
     horizons_m = request.horizons_m if request.horizons_m is not None else run.config.dropout.horizons_m
     errors = measure_errors(run, horizons_m, starts=starts, seed=seed, models=models, sink=sink)
-    return _report(run, errors, request)
+    return complete_report(run, errors, request, ReportParts())
 
 
 def dropout_report(
@@ -167,22 +143,12 @@ def dropout_report(
     `icrtool.records.requests.ReportRequest` has fields of the same names, and states the meaning of each.
     """
     request = ReportRequest(
-        horizons_m=None if horizons_m is None else tuple(horizons_m),
-        budgets_m=tuple(budgets_m),
-        gates=tuple(gate.text if isinstance(gate, Gate) else gate for gate in gates),
-        strict_gates=strict_gates,
-        allow_unusable=allow_unusable,
-        outage_s=None if outage_s is None else tuple(outage_s),
-        outage_at_s=tuple(outage_at_s),
-        starts=starts,
-        reference=reference,
-        without_events=without_events,
-        with_jumps=with_jumps,
-        refit_sensors=refit_sensors,
-        ladder=ladder,
-        score=tuple(score),
-        seed=seed,
-    )
+        horizons_m=None if horizons_m is None else tuple(horizons_m), budgets_m=tuple(budgets_m),
+        gates=tuple(gate.text if isinstance(gate, Gate) else gate for gate in gates), strict_gates=strict_gates,
+        allow_unusable=allow_unusable, outage_s=None if outage_s is None else tuple(outage_s),
+        outage_at_s=tuple(outage_at_s), starts=starts, reference=reference, without_events=without_events,
+        with_jumps=with_jumps, refit_sensors=refit_sensors, ladder=ladder, score=tuple(score), seed=seed,
+    )  # fmt: skip
     return report_on(run, request, log=log, calibrations=calibrations, baseline=baseline, sink=sink)
 
 
@@ -212,9 +178,9 @@ def report_on(
     unusable = "" if run.usable or request.allow_unusable else str(run.document.unusable_because)
     # Both are computed and released before the models are compared, which needs columns of the same size.
     examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, request.starts)
-    rows = _TestedRows((), (), (), (), None, unusable)
+    rows = TestedRows((), (), (), (), None, unusable)
     if not unusable:
-        rows = _tested_rows(runs, calibrations, scored, request, watch)
+        rows = tested_rows(compared, runs.filtered, calibrations, scored, request, watch)
     compared_models, horizons_m = rows.compared_models, _horizons_of(run, request, limits)
     errors = measure_errors(
         compared, horizons_m, further=rows.all, starts=request.starts, seed=request.seed, sink=sink,
@@ -226,39 +192,59 @@ def report_on(
         against := why_unusable(run.document, errors, [row.name for row in compared_models.rows])
     ):
         compared, errors = _contradicted(compared, errors, against)
-        compared_models, unusable = (
-            compared_models._replace(calibration=None),
-            "" if request.allow_unusable else against.text,
-        )
-    cost = None
-    if request.without_events:
-        crossed = replace(compared, in_gap=runs.with_events.in_gap)
-        cost = measure_errors(crossed, horizons_m, starts=request.starts, seed=request.seed)
+        compared_models = compared_models._replace(calibration=None)
+        unusable = "" if request.allow_unusable else against.text
     by_start = shown_paths.errors_by_start(compared, compared_models, starts=request.starts)
-    budgets_m = () if unusable else request.budgets_m
-    budgets = [reach for budget_m in budgets_m for reach in report.budget_distances(errors, budget_m)]
-    return _report(
-        compared, errors, request,
-        with_events=cost,
+    parts = ReportParts(
+        with_events=_errors_with_events(runs, compared, horizons_m, request),
+        calibrations=rows.calibrations,
         compared_models=compared_models,
         left_out=rows.left_out,
-        calibrations=rows.calibrations,
-        examples=examples,
-        worst=shown_paths.worst_trials(compared, compared_models, further=rows.of_topics, errors=by_start),
-        path_errors=by_start.on_path,
-        outages=(*forced, *shown_paths.real_outages(compared)),
-        budgets=with_other_grounds(budgets, rows.calibrations),
-        gates=tuple(
-            report.verdict_on(gate, run.name, passed=False, unusable=unusable)
-            if unusable
-            else report.check_gate(gate, errors, baseline, strict=request.strict_gates)
-            for gate in limits
-        ),
-        usable=not unusable,
-        baseline=baseline,
+        budgets=_distances_within(errors, () if unusable else request.budgets_m, rows.calibrations),
+        gates=_verdicts(limits, errors, baseline, unusable, strict=request.strict_gates),
         by_turning=by_turning,
+        worst=shown_paths.worst_trials(compared, compared_models, further=rows.of_topics, errors=by_start),
+        examples=examples,
+        outages=(*forced, *shown_paths.real_outages(compared)),
+        path_errors=by_start.on_path,
+        baseline=baseline,
+        usable=not unusable,
         notes=rows.notes,
-    )  # fmt: skip
+    )
+    return complete_report(compared, errors, request, parts)
+
+
+def _errors_with_events(
+    runs: _Runs, compared: Run, horizons_m: Iterable[float], request: ReportRequest
+) -> report.OpenLoopErrors | None:
+    """Return the errors of all trials if the request leaves out the trials across slip events, else None."""
+    if not request.without_events:
+        return None
+    crossed = replace(compared, in_gap=runs.with_events.in_gap)
+    return measure_errors(crossed, horizons_m, starts=request.starts, seed=request.seed)
+
+
+def _distances_within(
+    errors: report.OpenLoopErrors, budgets_m: Iterable[float], calibrations: Sequence[UsedCalibration]
+) -> tuple[BudgetDistance, ...]:
+    """Return the distance within each budget [m] by row, with the intervals on another ground."""
+    reaches = [reach for budget_m in budgets_m for reach in report.budget_distances(errors, budget_m)]
+    return with_other_grounds(reaches, calibrations)
+
+
+def _verdicts(
+    limits: Iterable[Gate],
+    errors: report.OpenLoopErrors,
+    baseline: report.BaselineReport | None,
+    unusable: str,
+    *,
+    strict: bool,
+) -> tuple[Verdict, ...]:
+    """Return the verdict on each acceptance limit; a run that is not usable fails them all, for the reason given."""
+    if unusable:
+        log = errors.run_document.log
+        return tuple(report.verdict_on(gate, log, passed=False, unusable=unusable) for gate in limits)
+    return tuple(report.check_gate(gate, errors, baseline, strict=strict) for gate in limits)
 
 
 class _Runs(NamedTuple):
@@ -308,55 +294,6 @@ def _horizons_of(run: Run, request: ReportRequest, limits: Iterable[Gate]) -> li
     return horizons_m
 
 
-class _TestedRows(NamedTuple):
-    """The rows of a report that do not come from the filter's ICRs.
-
-    Attributes
-    ----------
-    of_calibrations, of_topics : rows of the calibrations, and of the scored topics
-    calibrations : the record of each used calibration
-    notes : findings about the sensors of calibrations, and about topics
-    compared_models : the rows of this log's own models; None if they were left out
-    left_out : reason for which they were left out
-    """
-
-    of_calibrations: Sequence[ComparedRow]
-    of_topics: Sequence[ComparedRow]
-    calibrations: tuple[UsedCalibration, ...]
-    notes: tuple[Note, ...]
-    compared_models: ComparedModels | None
-    left_out: str
-
-    @property
-    def all(self) -> list[ComparedRow]:
-        """All rows, in the order of the report."""
-        return [
-            *(() if self.compared_models is None else self.compared_models.rows),
-            *self.of_calibrations,
-            *self.of_topics,
-        ]
-
-
-def _tested_rows(
-    runs: _Runs, calibrations: Sequence[Calibration], scored: Sequence[TopicPoses], request: ReportRequest, watch: Watch
-) -> _TestedRows:
-    """Return the rows of calibrations, of scored topics and of this log's own models."""
-    filtered, compared = runs.filtered, runs.compared
-    watch("calibrations")
-    used, of_calibrations, notes = _calibration_rows(compared, filtered, calibrations, request)
-    of_topics, topic_notes = topic_rows(compared, track_of(compared), scored) if scored else ([], [])
-    compared_models, left_out = None, ""
-    if request.ladder:
-        watch("comparing models")
-        try:
-            compared_models = compare_models(
-                compared, measured_headings(filtered), calibrations, filtered, refit_sensors=request.refit_sensors
-            )
-        except DataError as err:
-            left_out = f"{err.why}, {err.advice}"
-    return _TestedRows(of_calibrations, of_topics, used, (*notes, *topic_notes), compared_models, left_out)
-
-
 def _contradicted(run: Run, errors: report.OpenLoopErrors, why: Note) -> tuple[Run, report.OpenLoopErrors]:
     """Return a run and its errors, marked as not usable; the errors stay in the report to show the contradiction."""
     document = msgspec.structs.replace(
@@ -383,210 +320,6 @@ def _scored_topics(request: ReportRequest, log: str | Path | None) -> Sequence[T
     return read_topic_poses(log, list(dict.fromkeys(request.score)))
 
 
-def _report(
-    run: Run, errors: report.OpenLoopErrors, request: ReportRequest, *,
-    with_events: report.OpenLoopErrors | None = None, calibrations: tuple[UsedCalibration, ...] = (),
-    budgets: tuple[BudgetDistance, ...] = (), gates: tuple[Verdict, ...] = (),
-    by_turning: tuple[TurningSplit, ...] = (), compared_models: ComparedModels | None = None, left_out: str = "",
-    worst: tuple[documents.ExampleTrial, ...] = (), examples: tuple[documents.ExampleTrial, ...] = (),
-    outages: tuple[documents.Outage, ...] = (), baseline: report.BaselineReport | None = None, usable: bool = True,
-    notes: tuple[Note, ...] = (), path_errors: documents.PathErrors | None = None,
-) -> report.DropoutReport:  # fmt: skip
-    """Return the report of a run.
-
-    Parameters
-    ----------
-    errors : errors of the models of the run
-    with_events : errors of all trials, if `errors` leaves out the trials that cross a slip event
-    notes : notes about the rows, in addition to the notes of the run
-    """
-    calibration = None if compared_models is None else compared_models.calibration
-    notes = (*run.notes, *(() if compared_models is None else compared_models.notes), *notes)
-    event_cost = None
-    if with_events is not None:
-        all_rows = {result.name: result.document.by_horizon for result in with_events.results}
-        numbers = {
-            name: [documents.ErrorRow(*astuple(row)[:ERROR_FIELDS]) for row in rows] for name, rows in all_rows.items()
-        }
-        event_cost = documents.EventCostDocument(len(run.sensors.events), numbers)
-    earlier = None
-    if baseline is not None:
-        same, changes = baseline.is_of(run.document), baseline.changes(run.document)
-        earlier = documents.BaselineDocument(baseline.path, baseline.log, baseline.tool_version, same, changes)
-    document = documents.DropoutDocument(
-        schema=documents.DROPOUT_SCHEMA,
-        tool_version=__version__,
-        run=documents.RunOfReport(*(getattr(run.document, key) for key in documents.RunOfReport.__struct_fields__)),
-        usable=run.usable,
-        unusable_because=run.document.unusable_because,
-        notes=notes,
-        warnings=warnings_of(notes),
-        request=request,
-        starts=errors.states,
-        starts_standing=errors.standing,
-        without_events=event_cost,
-        tolerance_m=TOLERANCE_M,
-        intervals=documents.IntervalsDocument(
-            method="Student's t over blocks of path",
-            block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_PATH_BLOCKS} to {MOST_PATH_BLOCKS} blocks",
-            level=LEVEL,
-            seed=request.seed,
-            next_level=NEXT_LEVEL,
-        ),
-        models=tuple(result.document for result in errors.results),
-        trials=tuple(_counts(errors, with_events)),
-        reference_error=errors.reference,
-        by_learning=errors.by_learning,
-        calibrations=calibrations,
-        # The date is left out, so that the same run gives the same file.
-        recommended=None if calibration is None else msgspec.structs.replace(calibration, created=UNSET),
-        budgets=budgets,
-        best=report.best_row(errors, calibrations) if usable else None,
-        by_turning=by_turning,
-        ladder=_ladder(errors, calibrations, compared_models, left_out),
-        gates=gates,
-        passed=all(verdict.passed for verdict in gates),
-        baseline=earlier,
-        outages=tuple(outage.document for outage in outages),
-        worst=tuple(trial.document for trial in worst),
-        examples=tuple(trial.document for trial in examples),
-    )
-    return report.DropoutReport(
-        **{field.name: getattr(errors, field.name) for field in fields(errors)}, document=document,
-        run_directory=run.directory, reference_north_m=run.table.north_m, reference_east_m=run.table.east_m,
-        usable=usable, worst=worst, examples=examples, outages=outages, path_errors=path_errors,
-        calibration=calibration, baseline=baseline,
-    )  # fmt: skip
-
-
-def _counts(
-    errors: report.OpenLoopErrors, with_events: report.OpenLoopErrors | None
-) -> Iterator[documents.CountDocument]:
-    """Yield how many starts gave a trial at each horizon, and why the others gave none."""
-    # The reasons are counted over all trials. With --without-events a slip event would be counted as a gap.
-    counts = (with_events or errors).counts
-    crossing = counts.trials - errors.counts.trials
-    driven = distance_text(errors.run_document.drive.distance_m)
-    reasons = {
-        "too_little_way_left": (f"less than that is left of the {driven} driven", counts.short),
-        "across_wheel_gap": ("the path crosses a gap in the wheel data", counts.gap),
-        "ends_in_gnss_outage": ("it ends in a GNSS outage", counts.outage),
-        "from_standstill": ("the robot stands", counts.standing),
-        "crosses_jump": ("the reference jumps on the path", counts.crosses_jump),
-        "across_slip_event": ("the path crosses a slip event", crossing),
-    }
-    for h, horizon_m in enumerate(errors.horizons_m.tolist()):
-        trials, starts = int(errors.counts.trials[h]), {key: int(count[h]) for key, (_, count) in reasons.items()}
-        why = ", ".join(f"{text} ({starts[key]:,} starts)" for key, (text, _) in reasons.items() if starts[key])
-        if starts["too_little_way_left"] == errors.states:
-            why = reasons["too_little_way_left"][0]
-        yield documents.CountDocument(horizon_m, trials, starts, None if trials else why)
-
-
-def _ladder(
-    errors: report.OpenLoopErrors,
-    calibrations: Sequence[UsedCalibration],
-    compared_models: ComparedModels | None,
-    why_none: str,
-) -> documents.LadderDocument:
-    """Return the comparison of the models, or why it was left out."""
-    if compared_models is None:
-        return documents.LadderDocument(left_out=why_none)
-    of_calibrations, turned = {used.name for used in calibrations}, f"_{compared_models.heading}"
-    models = []
-    for result in errors.results:
-        if result.name not in of_calibrations and kind_of(result.name) != TOPIC_ROW:
-            with_heading = bool(compared_models.heading) and result.name.endswith(turned)
-            rows = [astuple(row)[1:ERROR_FIELDS] for row in result.document.by_horizon]
-            heading = compared_models.heading if with_heading else "wheels"
-            models.append(
-                documents.ScoreDocument(
-                    result.name, result.document.knows, heading, *map(list, zip(*rows, strict=True))
-                )
-            )
-    table, fits = compared_models.table, {}
-    for name, fit in table.fits.items():
-        value, std = (dict(zip(fit.model.terms, column.tolist(), strict=True)) for column in (fit.parameters, fit.std))
-        fits[name] = documents.FitDocument(plain_value(value), plain_value(std))
-    return documents.LadderDocument(
-        horizons_m=errors.horizons_m.tolist(),
-        blocks=len(table.folds),
-        starts=int(np.count_nonzero((table.trials[0].ends >= 0).any(axis=1))),
-        heading=compared_models.heading or None,
-        notes=list(compared_models.notes),
-        models=models,
-        width_m=table.recordings[0].width_m,
-        fits=fits,
-    )
-
-
 def forced_lengths_s(run: Run, request: ReportRequest) -> Sequence[float]:
     """Return the lengths [s] of the forced outages, from the request or else from the run's configuration."""
     return request.outage_s if request.outage_s is not None else run.config.dropout.forced_outage_s
-
-
-def with_other_grounds(
-    budgets: Iterable[BudgetDistance], calibrations: Sequence[UsedCalibration]
-) -> tuple[BudgetDistance, ...]:
-    """Return the distances within budgets; for rows with a calibration, with the interval on another ground."""
-    scores = {
-        used.name: used.calibration.other_grounds or ()
-        for used in calibrations
-        if used.calibration is not None and not used.fitted_to_this
-    }
-    # Row ``adaptive`` begins with the first calibration that was not fitted to this log.
-    first = next(iter(scores.values()), ())
-    distances = []
-    for reach in budgets:
-        by, row_kind = turned_by(reach.model), kind_of(reach.model)
-        row = f"{RECOMMENDED if row_kind == 'calibration' else row_kind}{f'_{by}' if by else ''}"
-        of_row = {"calibration": scores.get(reach.model, ()), "adaptive": first}.get(row_kind, ())
-        ends = other_ground_ends(of_row, row, reach.budget_m)
-        if ends is None:
-            distances.append(reach)
-        else:
-            distances.append(msgspec.structs.replace(reach, other_low_m=ends[0], other_high_m=ends[1]))
-    return tuple(distances)
-
-
-def _calibration_rows(
-    run: Run, past: Run, calibrations: Sequence[Calibration], request: ReportRequest
-) -> tuple[tuple[UsedCalibration, ...], list[ComparedRow], list[Note]]:
-    """Return the record of each used calibration, the rows of the calibrations, and notes about their sensors.
-
-    `past` is the run with the poses of the filter.
-    """
-    used, models, notes = [], [], list[Note]()
-    if not calibrations:
-        return (), [], []
-    recording = turning_recording_of(run)
-    driven = with_poses_of(recording, past)
-    for number, calibration in enumerate(calibrations, start=1):
-        name = "calibration"
-        if len(calibrations) > 1:
-            stem = calibration.name or str(number)
-            if calibration.name and sum(other.name == calibration.name for other in calibrations) > 1:
-                stem = f"{stem}-{number}"
-            name = f"calibration:{stem}"
-        created = calibration.created or ""
-        of_sensors = dict.fromkeys(CalibrationFile.__struct_fields__[1:], UNSET)
-        short_record = msgspec.structs.replace(calibration, models={}, held_out=(), name=UNSET, **of_sensors)
-        fitted_to_this = calibration.fitted_to(recording.sha256)
-        fitted = "fitted to this log" if fitted_to_this else "not fitted to this log"
-        refitted = "; sensors refitted" if request.refit_sensors else ""
-        rows = [(name, calibration.recommended, False)]
-        if calibration.gyro is not None and recording.track.gyro is not None:
-            rows.append((f"{name}_gyro", calibration.gyro.model, True))
-        for row, model, with_gyro in rows:
-            tested = calibrated_drive(
-                calibration, recording, row, driven, with_gyro=with_gyro, refit_sensors=request.refit_sensors
-            )
-            models.append(ComparedRow(row, tested.drive.errors, knows=f"other logs ({fitted}); {tested.knows}"))
-            notes += tested.notes
-            words = f"{fitted}{refitted}", tested.sensors
-            used.append(
-                UsedCalibration(
-                    row, model, len(calibration.logs), fitted_to_this, created, with_gyro, short_record, *words
-                )
-            )
-    return tuple(used), models, notes

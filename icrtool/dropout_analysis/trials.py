@@ -101,8 +101,7 @@ def measure_errors(
     sparse = starts_of_further if starts_of_further is not None else _sparse_starts(standing)
     sparse_errors = _errors_of_few(track, predictors, Trials(sparse, counted_ends(track, horizons, starts, sparse)))
     by_model: list[list[_AtHorizon]] = [[] for _ in predictors]
-    counts: list[TrialCounts] = []
-    drawn: list[list[DrawnTrials]] = []
+    counts, drawn = list[TrialCounts](), list[list[DrawnTrials]]()
     before, after = list[documents.ErrorRow](), list[documents.ErrorRow]()
     at_once = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
     with ThreadPoolExecutor(TRIAL_THREADS) as pool:

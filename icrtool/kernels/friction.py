@@ -108,6 +108,20 @@ def second_moments(contact_x: Floats, contact_y: Floats) -> tuple[float, float]:
 
 
 @njit_part
+def load_growth(a_x: float, a_y: float, sum_xx: float, sum_yy: float, body: SlidingBody) -> tuple[float, float]:
+    """Return the growth of a contact's load with its place ahead and to the right [N/m].
+
+    Parameters
+    ----------
+    a_x, a_y : acceleration that the load follows [m/s^2]
+    sum_xx, sum_yy : `second_moments` of the contacts [m^2]
+    """
+    per_x = (GRAVITY_MPS2 * body.mass_forward - a_x * body.mass_height) * body.mass / sum_xx
+    per_y = (GRAVITY_MPS2 * body.mass_right - a_y * body.mass_height) * body.mass / sum_yy
+    return per_x, per_y
+
+
+@njit_part
 def driver_commands(forward: float, turn: float, heading_error: float, body: SlidingBody) -> tuple[float, float]:
     """Return the track speeds [m/s], left and right, that the driver commands.
 
@@ -119,6 +133,17 @@ def driver_commands(forward: float, turn: float, heading_error: float, body: Sli
     wanted = turn + body.steering * heading_error
     wanted = min(max(wanted, -body.largest_turn), body.largest_turn)
     return forward - body.y_left * wanted, forward - body.y_right * wanted
+
+
+@njit_part
+def origin_velocity(u: float, w: float, omega: float, body: SlidingBody) -> tuple[float, float]:
+    """Return the velocity of the body origin, ahead and to the right [m/s].
+
+    Parameters
+    ----------
+    u, w, omega : velocity of the centre of mass, ahead and to the right [m/s], and turn rate [rad/s]
+    """
+    return u + omega * body.mass_right, w - omega * body.mass_forward
 
 
 @njit_part
@@ -148,7 +173,7 @@ def slide(
     grip : (g, 2) friction coefficient of left and right side by cell of distance; it repeats
     slope : (n, 2) downhill slope ahead and to the right, as a share of the weight
     body : constants
-    commands, tracks : (n, 2) become commanded and true track speeds, left and right [m/s]
+    commands, tracks : (n, 2) become commanded speeds, and mean true speeds until the next time, left and right [m/s]
     pose : (n, 3) row 0 is the start; becomes N, E [m], psi [rad]
     velocity : (n, 3) becomes v_x, v_y [m/s], omega [rad/s] of the body origin
 
@@ -161,22 +186,19 @@ def slide(
     cells = len(grip)
     sum_xx, sum_yy = second_moments(contact_x, contact_y)
     north, east, psi = pose[0, 0], pose[0, 1], pose[0, 2]
-    # The state is the velocity of the centre of mass, track speeds, commands, the acceleration that the load follows,
-    # and the distance.
-    u, w, omega = 0.0, 0.0, 0.0
+    # velocity of the centre of mass, acceleration that the load follows, distance; track speeds, commands
+    u, w, omega, a_x, a_y, driven = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     left, right, command_left, command_right = 0.0, 0.0, 0.0, 0.0
-    a_x, a_y, driven = 0.0, 0.0, 0.0
     for k in range(len(t)):
         if decides[k]:
             command_left, command_right = driver_commands(forward[k], turn[k], heading[k] - psi, body)
         if k == 0:
-            left, right, u = command_left, command_right, forward[0]
-            omega = turn[0]
+            left, right, u, omega = command_left, command_right, forward[0], turn[0]
             w = omega * body.mass_forward
-        v_y = w - omega * body.mass_forward
+        v_x, v_y = origin_velocity(u, w, omega, body)
         commands[k, 0], commands[k, 1], tracks[k, 0], tracks[k, 1] = command_left, command_right, left, right
         pose[k, 0], pose[k, 1], pose[k, 2] = north, east, psi
-        velocity[k, 0], velocity[k, 1], velocity[k, 2] = u + omega * body.mass_right, v_y, omega
+        velocity[k, 0], velocity[k, 1], velocity[k, 2] = v_x, v_y, omega
         if k + 1 == len(t):
             break
         steps = math.ceil((t[k + 1] - t[k]) / LONGEST_SUBSTEP_S - 1e-9)
@@ -187,11 +209,9 @@ def slide(
         for _ in range(steps):
             left, right = command_left + (left - command_left) * kept, command_right + (right - command_right) * kept
             mean_left, mean_right = mean_left + left / steps, mean_right + right / steps
-            v_y = w - omega * body.mass_forward
+            v_x, v_y = origin_velocity(u, w, omega, body)
             cell = int(driven / body.cell) % cells
-            per_x = (GRAVITY_MPS2 * body.mass_forward - a_x * body.mass_height) * body.mass / sum_xx
-            per_y = (GRAVITY_MPS2 * body.mass_right - a_y * body.mass_height) * body.mass / sum_yy
-            v_x = u + omega * body.mass_right
+            per_x, per_y = load_growth(a_x, a_y, sum_xx, sum_yy, body)
             force_x, force_y, moment = contact_forces(
                 v_x, v_y, omega, left, right, per_x, per_y, contact_x, contact_y, grip[cell], body
             )
@@ -203,9 +223,7 @@ def slide(
                 w + dt * (pull_y - omega * u),
                 omega + dt * moment / body.inertia,
             )
-            v_y = w - omega * body.mass_forward
-            v_x = u + omega * body.mass_right
+            v_x, v_y = origin_velocity(u, w, omega, body)
             north, east, psi = moved_pose(north, east, psi, v_x, v_y, omega, dt)
             driven += dt * math.sqrt(v_x * v_x + v_y * v_y)
-        # The mean speed over the step gives the distance that the tracks travelled.
         tracks[k, 0], tracks[k, 1] = mean_left, mean_right

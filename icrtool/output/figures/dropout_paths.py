@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.output.figures import style
 from icrtool.output.figures.labels import Label, write_labels
 from icrtool.output.figures.sheet import new_sheet, styled
@@ -280,6 +280,22 @@ MARKED_WORST = 3
 """Number of worst trials whose starts are marked."""
 
 
+def _errors_of_parts(rows: Ints, errors: PathErrors) -> Floats:
+    """Return the largest error (n - 1,) [m] of the trials that start in each part of a path between rows (n,).
+
+    A part without a start has the error of the last start before it, up to twice the usual distance between starts, and
+    NaN further on.
+    """
+    nearest = np.maximum(np.searchsorted(errors.start, rows[:-1], side="right") - 1, 0)
+    spacing = float(np.median(np.diff(errors.start))) if len(errors.start) > 1 else 1.0
+    behind = rows[:-1] - errors.start[nearest]
+    error_m = np.where((behind >= 0) & (behind <= 2.0 * spacing), errors.error_m[nearest], np.nan)
+    inside = np.searchsorted(rows, errors.start, side="right") - 1
+    largest = np.full(len(rows), np.nan)
+    np.fmax.at(largest, inside, errors.error_m)
+    return np.where(np.isfinite(largest[:-1]), largest[:-1], error_m)
+
+
 @styled
 def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Axes:
     """Return the figure of the path [m], each place coloured by the error [m] of the trial that starts there.
@@ -308,16 +324,7 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
     cell = show_from_above(axes, north, east, margin=0.06, ticks=9)
     draw_path(axes, north, east, cell, UNSCORED, zorder=2, label="no trial starts here")
     rows = rows_entering_cells(north, east, CELLS_A_STEP * cell)
-    # Each part of the path has its largest error; a part without a start has that of the last start before it, up to
-    # twice the usual distance between starts.
-    nearest = np.maximum(np.searchsorted(errors.start, rows[:-1], side="right") - 1, 0)
-    spacing = float(np.median(np.diff(errors.start))) if len(errors.start) > 1 else 1.0
-    behind = rows[:-1] - errors.start[nearest]
-    error_m = np.where((behind >= 0) & (behind <= 2.0 * spacing), errors.error_m[nearest], np.nan)
-    inside = np.searchsorted(rows, errors.start, side="right") - 1
-    largest = np.full(len(rows), np.nan)
-    np.fmax.at(largest, inside, errors.error_m)
-    error_m = np.where(np.isfinite(largest[:-1]), largest[:-1], error_m)
+    error_m = _errors_of_parts(rows, errors)
     # The largest errors lie on top.
     drawn = np.flatnonzero(np.isfinite(error_m))
     drawn = drawn[np.argsort(error_m[drawn], kind="stable")]

@@ -347,14 +347,6 @@ def read_measurements(
         if "gyro_topic" in columns:
             topic = columns["gyro_topic"].astype(np.uint8).tobytes().decode("utf-8", "surrogatepass")
             gyro = GyroSamples(topic, *(_checked(columns, f"gyro_{name}", name) for name in ("stamp_ns", "rate_radps")))
-        attitude = None
-        if "attitude_stamp_ns" in columns:
-            attitude = HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
-            stamps_ns = attitude.stamp_ns
-            if gyro is not None and np.array_equal(stamps_ns, gyro.stamp_ns):
-                # Most inertial units send attitude and turn rate in one message: both columns share their memory.
-                stamps_ns = gyro.stamp_ns
-            attitude = replace(attitude, stamp_ns=stamps_ns, var_rad2=without_repeats(attitude.var_rad2))
         sensors = SensorData(
             name=document.log,
             wheels=WheelSamples(stamps, left, right),
@@ -366,7 +358,7 @@ def read_measurements(
             # The documents also have seconds; the records of the log have stamps alone.
             events=msgspec.convert(document.events, tuple[SlipEvent, ...], from_attributes=True),
             jumps=msgspec.convert(document.reference_jumps, tuple[ReferenceJump, ...], from_attributes=True),
-            attitude=attitude,
+            attitude=_attitude(columns, gyro),
         )
         outcomes = []
         for group, stamps_ns in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns)):
@@ -379,6 +371,19 @@ def read_measurements(
     first = len(stamps) - len(table)
     states = table.changed(stamp_ns=stamps[first:], v_left_mps=left[first:], v_right_mps=right[first:])
     return states, sensors, outcomes[0], outcomes[1]
+
+
+def _attitude(columns: dict[str, NDArray[Any]], gyro: GyroSamples | None) -> HeadingSamples | None:
+    """Return the headings of an inertial unit; None for a run without them.
+
+    Most units send attitude and turn rate in one message: equal stamps share the memory of the gyro's stamps.
+    """
+    if "attitude_stamp_ns" not in columns:
+        return None
+    attitude = HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
+    same = gyro is not None and np.array_equal(attitude.stamp_ns, gyro.stamp_ns)
+    stamps_ns = gyro.stamp_ns if gyro is not None and same else attitude.stamp_ns
+    return replace(attitude, stamp_ns=stamps_ns, var_rad2=without_repeats(attitude.var_rad2))
 
 
 def spans_of(pairs: object) -> Ints:

@@ -13,7 +13,7 @@ from icrtool.calibration.other_grounds import (
     other_ground_ends,
 )
 from icrtool.calibration.pooled import calibrate_recordings, predictor
-from icrtool.dropout_analysis.dropout_report import with_other_grounds
+from icrtool.dropout_analysis.report_document import with_other_grounds
 from icrtool.kernels.error_statistics import PRIOR_FREEDOM, ground_interval
 from icrtool.motion.recording import Recording, cut_trials
 from icrtool.records.acceptance import BudgetDistance
