@@ -149,6 +149,9 @@ def test_spans_begin_and_end_at_measured_headings() -> None:
     np.testing.assert_array_equal(end, [4.0, 4.0, 6.0])
 
 
+RARE = (*((every_s, False) for every_s in EVERY_S), (2.0, True), (5.0, True))
+"""Time between poses, and whether others are interpolated between them."""
+
 REAL = ("warthog_asphalt", "warthog_grass.bag", "warthog_grass_0718", "warthog_grass_0729", "warthog_grass_0808")
 
 
@@ -161,8 +164,7 @@ def recorded(path: Path) -> tuple[RobotLog, Config, tuple[float, float]]:
 
 
 @pytest.mark.parametrize("name", REAL)
-@pytest.mark.parametrize("every_s", EVERY_S)
-@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize(("every_s", "linear"), RARE)
 def test_recorded_poses_may_be_rare(shared_logs: Path, name: str, every_s: float, linear: bool) -> None:
     log, config, full = recorded(shared_logs / "real" / name)
     rare = thinned(log, every_s)
@@ -183,8 +185,7 @@ def simulated(path: Path) -> tuple[RobotLog, Config, tuple[float, float]]:
 
 
 @pytest.mark.parametrize("name", ["tracked_curved.bag", "wheeled_lawnmower"])
-@pytest.mark.parametrize("every_s", EVERY_S)
-@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize(("every_s", "linear"), RARE)
 def test_simulated_poses_may_be_rare(shared_logs: Path, name: str, every_s: float, linear: bool) -> None:
     log, config, full = simulated(shared_logs / "simulated" / name)
     rare = thinned(log, every_s)

@@ -17,6 +17,7 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import RunError
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures import style as figure_style
@@ -140,12 +141,27 @@ def test_a_file_that_changes_while_a_run_is_in_use_is_noticed(lean: Run, how: st
         assert lean.table.std_north_m
 
 
-@pytest.mark.parametrize("reference", ["filter", "smoothed"])
-def test_a_run_that_holds_fewer_columns_reports_the_same(reference: Any, whole: Run, lean: Run) -> None:
-    fresh, read = (
-        dropout_report(one, horizons_m=[1.0, 5.0], reference=reference, allow_unusable=True) for one in (whole, lean)
+def reported(run: Run, reference: Any) -> DropoutReport:
+    return dropout_report(
+        run,
+        horizons_m=[1.0, 5.0],
+        outage_s=[4.0],
+        outage_at_s=[12.0],
+        gates=["icr.p95@2m <= 9"],
+        reference=reference,
+        allow_unusable=True,
     )
-    assert json_bytes(read.document) == json_bytes(fresh.document)
+
+
+@pytest.fixture(scope="module", params=["filter", "smoothed"])
+def fresh(request: pytest.FixtureRequest, whole: Run) -> tuple[str, DropoutReport]:
+    """A reference, and the report of the run that was not read back."""
+    return request.param, reported(whole, request.param)
+
+
+def test_a_run_that_holds_fewer_columns_reports_the_same(fresh: tuple[str, DropoutReport], lean: Run) -> None:
+    reference, report = fresh
+    assert json_bytes(reported(lean, reference).document) == json_bytes(report.document)
 
 
 def test_a_run_read_back_prints_the_same(whole: Run, stored: Run) -> None:
@@ -160,22 +176,11 @@ def test_a_run_read_back_draws_the_same(name: str, whole: Run, stored: Run) -> N
     assert first == second
 
 
-@pytest.mark.parametrize("reference", ["filter", "smoothed"])
-def test_a_run_read_back_reports_the_same(reference: Any, whole: Run, stored: Run) -> None:
-    fresh, read = (
-        dropout_report(
-            one,
-            horizons_m=[1.0, 5.0],
-            outage_s=[4.0],
-            outage_at_s=[12.0],
-            gates=["icr.p95@2m <= 9"],
-            reference=reference,
-            allow_unusable=True,
-        )
-        for one in (whole, stored)
-    )
-    assert json_bytes(read.document) == json_bytes(fresh.document)
-    assert format_dropout(read) == format_dropout(fresh)
+def test_a_run_read_back_reports_the_same(fresh: tuple[str, DropoutReport], stored: Run) -> None:
+    reference, report = fresh
+    read = reported(stored, reference)
+    assert json_bytes(read.document) == json_bytes(report.document)
+    assert format_dropout(read) == format_dropout(report)
     assert {outage.kind for outage in read.document.outages} == {"forced", "real"}
     assert read.document.ladder.models
     assert {verdict.horizon_m for verdict in read.document.gates} <= set(read.horizons_m)
