@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ ROLLS, SLIPS = (0.101, -0.101, 0.0), (0.15, -0.14, 0.0)
 SEEDS = 8
 
 
+@functools.cache
 def run_of(seed: int, icrs: tuple[float, float, float], wheels_vary: float = 0.01) -> Run:
     return fit(make_pose_log(seed, 3e-4, 0.1, icrs, wheels_vary=wheels_vary), CONFIG)
 
