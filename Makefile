@@ -140,8 +140,8 @@ samples: $(DEV)  ## simulate the sample logs again
 wheel-check: $(DEV)
 	@PYTHON=$(PYTHON) BUILD_PYTHON=$(BIN)/python scripts/check-wheel.sh
 
-check: format-check lint  ## everything CI runs, the built wheel included
-	@$(MAKE) --no-print-directory --jobs=2 types wheel-check bench-quick
+check: $(DEV)  ## everything CI runs, the built wheel included
+	@$(MAKE) --no-print-directory --jobs=2 format-check lint types wheel-check bench-quick
 	@$(MAKE) --no-print-directory test
 
 # uv resolves for every platform and Python from 3.11 on, and keeps the versions already pinned where it can.
