@@ -194,6 +194,12 @@ def command(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return script
 
 
+@pytest.fixture(scope="module")
+def completion(command: Path) -> str:
+    """What the command gives bash to evaluate."""
+    return subprocess.run([command, "completion", "bash"], capture_output=True, text=True, check=True).stdout
+
+
 @pytest.mark.parametrize(
     ("words", "completed"),
     [
@@ -207,12 +213,14 @@ def command(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["ro"], {"robots"}),
     ],
 )  # fmt: skip
-def test_bash_completes_names_keys_and_topics(command: Path, words: list[str], completed: set[str]) -> None:
+def test_bash_completes_names_keys_and_topics(
+    command: Path, completion: str, words: list[str], completed: set[str]
+) -> None:
     bash = shutil.which("bash")
     if bash is None:
         pytest.skip("bash is not installed")
     script = f"""
-        eval "$({shlex.quote(str(command))} completion bash)"
+        {completion}
         COMP_WORDS=(icrtool {shlex.join(words)}); COMP_CWORD={len(words)}
         _icrtool_completion {shlex.quote(str(command))}
         printf '%s\\n' "${{COMPREPLY[@]}}"
