@@ -118,7 +118,7 @@ def test_what_is_not_in_the_baseline_is_reported_and_all_of_it_is_an_error(place
     (baseline / "fleet.json").write_text(json.dumps(document), encoding="utf-8")
     status, out, err = icrtool(*command, *gate)
     assert (status, out) == (1, "")
-    assert "robots there: another; asked: husky-a200" in err
+    assert "robots in it: another; robots of the logs: husky-a200" in err
     assert icrtool("dropout-report", "logs/field.mcap", "--robot", "husky-a200", *command[-2:], *gate)[0] == 1
     # New recordings are compared with all drives of their robot, and what is met is printed too.
     for one in document["logs"]:

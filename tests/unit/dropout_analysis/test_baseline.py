@@ -284,7 +284,7 @@ def test_drives_of_another_robot_or_group_are_not_pooled(report: DropoutReport, 
     assert (found.log, len(found.drives)) == ("2 drives of husky", 2)
     assert baseline.find("new", ["other"], "warthog") is None
     baseline.check_compares([("new", (), "warthog", ""), ("c", (), "", "")])
-    with pytest.raises(ConfigError, match="robots there: husky, jackal; asked: warthog"):
+    with pytest.raises(ConfigError, match="robots in it: husky, jackal; robots of the logs: warthog"):
         baseline.check_compares([("new", (), "warthog", "")])
 
 
