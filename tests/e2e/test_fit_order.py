@@ -67,7 +67,7 @@ def test_a_usable_run_names_the_command_that_tests_the_distance(icrtool, tmp_pat
         "distance    without GNSS: not known yet; the next command tests it",
         f"next        icrtool dropout-report {tmp_path / 'run'}",
     ]
-    for further in ((), ("-v",)):
+    for further in ((), ("-v", "--no-ladder")):
         status, out, _ = icrtool("dropout-report", tmp_path / "run", "--plots", "none", "--no-page", *further)
         assert status == 0
         assert out.count("How far without GNSS?") == 1

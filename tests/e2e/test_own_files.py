@@ -53,6 +53,7 @@ def test_a_batch_goes_on_in_a_folder_of_its_own_and_keeps_a_page_of_somebody_els
 def test_a_page_in_its_usual_place_replaces_only_a_page(icrtool: Command, run_place: Path, short_logs: Path) -> None:
     log = short_logs / "other.bag"
     assert icrtool("fit", log, "--robot", "husky-a200", "--plots", "none", "-q")[0] == 0
+    assert icrtool("dropout-report", "--plots", "none", "--no-page", "--no-ladder", "-q")[0] == 0
     page = run_place / "icrtool-runs" / log.stem / "report.html"
     page.write_bytes(OWN)
     assert icrtool("report")[0] == 1

@@ -105,8 +105,8 @@ def check_fits(lines: list[str]) -> None:
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_a_good_drive_is_answered_on_one_screen(screen: Screen) -> None:
-    status, lines = screen("fit", ROOT / "sample_logs" / "wheeled_lawnmower.mcap", *ROBOT, "--plots", "none")
+def test_a_good_drive_is_answered_on_one_screen(screen: Screen, short_segway_log: Path) -> None:
+    status, lines = screen("fit", short_segway_log, *ROBOT, "--plots", "none")
     check_fits(lines)
     text = "\n".join(lines)
     assert status == 0
