@@ -82,7 +82,7 @@ def test_the_95_percent_error_holds_on_drives_that_were_not_calibrated_with() ->
     inside, ratio = [], []
     for seed in SEEDS:
         parameters = draw_parameters(SIX, np.random.default_rng([seed, 3]))
-        new = make_recording(SIX, parameters, 10 * seed + 9, 300.0, name="new")
+        new = make_recording(SIX, parameters, 10 * seed + 9, 200.0, name="new")
         found, trials = calibrated(seed), cut_trials(new, HORIZONS_M)
         errors, (expected, p95) = predictor(found, new)(trials).position, forecast_trials(found, new, trials)
         inside.append(np.nanmean(np.where(np.isfinite(errors), errors <= p95, np.nan), axis=0))

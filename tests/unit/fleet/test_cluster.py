@@ -83,7 +83,7 @@ def test_workers_that_share_no_folder_give_all_of_a_bucket_to_a_bucket(
 
     # In the middle of a log of this worker: of two, one is at work while the other one writes a row.
     while len(there(".rows/")) < logs // 4 and batch.poll() is None:
-        time.sleep(0.1)  # each question costs the server 10 ms of CPU
+        time.sleep(0.25)  # each question costs the server 10 ms of CPU
     assert len(there(".rows/")) < logs
     processes[1].send_signal(signal.SIGKILL)
     document = json.loads(batch.communicate(timeout=500)[0])
