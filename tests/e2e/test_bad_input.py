@@ -538,7 +538,7 @@ def test_an_interrupted_run_leaves_a_whole_directory_or_nothing(tmp_path, option
         before = listing(folder)
         with start(folder, [str(path)]) as process:
             while process.poll() is None and len(set(listing(folder)) - set(before)) < entries:
-                time.sleep(0.002)
+                time.sleep(0.005)
             process.send_signal(signal.SIGINT)
             process.communicate(timeout=120)
         after = set(listing(folder)) - set(before)

@@ -119,7 +119,7 @@ def test_several_runs_are_pooled_and_each_is_left_out(icrtool, tmp_path: Path) -
     from icrtool.output.files.formats import open_calibration
 
     for seed in (1, 2, 3):
-        drive = ("--path", "curved", "--duration", "90", "--seed", seed, "-q", *RATES)
+        drive = ("--path", "curved", "--duration", "60", "--seed", seed, "-q", *RATES)
         icrtool("simulate", "-o", f"{seed}.mcap", *drive, *ROBOT)
     icrtool("fit", "2.mcap", *ROBOT, "-o", "run", "--plots", "none", "-q")
     status, out, err = icrtool("calibrate", "1.mcap", "3.mcap", *ROBOT, "-o", "cal.json", "-q")
