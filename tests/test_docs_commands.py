@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from icrtool.cli.commands import icrtool as command_line
+from support.batches import in_this_process
 from support.pictures import blank_pictures
 from support.pose_topics import dead_reckoned, measured, pose_plan, true_poses, write_pose_log
 
@@ -35,7 +36,7 @@ NOT_RUN = {
     "tests/unit/fleet/test_cluster.py runs one of Dask on this machine",
 }
 FEWER = {
-    "study": ["--runs", "2", "--duration", "20"], "simulate": ["--duration", "60"],
+    "study": ["--runs", "2", "--duration", "20"], "simulate": ["--duration", "40", "--heading-rate", "50"],
     "fit": ["--plots", "none"], "dropout-report": ["--plots", "none", "--no-page", "--no-ladder"],
     "batch": ["--plots", "none", "--no-ladder", "--no-page"],
 }  # fmt: skip
@@ -85,7 +86,8 @@ def run(*words: str) -> Result:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder with what the pages name: logs, runs, calibrations, a comparison, a plan."""
     folder = tmp_path_factory.mktemp("pages")
-    with contextlib.chdir(folder), blank_pictures():
+    with contextlib.chdir(folder), blank_pictures(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("icrtool.fleet.batch.process_apart", in_this_process)
         Path("sample_logs").symlink_to(ROOT / "sample_logs")
         robot = ["--robot", "husky-a200"]
         options = [*robot, "--path", "lawnmower", "--speed", "0.8", "--duration", "45", "--wheel-rate", "20",
