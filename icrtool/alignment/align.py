@@ -136,6 +136,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
             antenna_m=antenna_m,
             antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
             clock_std_s=streams.delays.clock_std_s,
+            heading_common_std_rad=0.0 if derived is None else derived.estimate.common_std,
             heading_sensor=log.heading_sensor,
         ),
         losses_ns=quality.losses_ns,

@@ -102,8 +102,10 @@ class StreamDelays(NamedTuple):
         ratio of the densities at zero after and before the drive).
         """
         value, std = self.apart
-        if self.together or not math.isfinite(std):
+        if self.together:
             return 0.0
+        if not math.isfinite(std):
+            return float(ESTIMATE_PRIOR_STD[POSITION_LAG]) * math.sqrt(0.5)
         if self.applied_gnss_s != self.applied_heading_s:
             return std
         agree = ESTIMATE_PRIOR_STD[POSITION_LAG] / std * math.exp(-0.5 * (value / std) ** 2)
@@ -245,7 +247,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         heading, correlation_s, of_heading = align_heading(log, config, fit, course, convention, derived)
         if derived is not None:
             log = derived.apply(log)
-            windows = windows_of_log(log, width, derived.smoothed)
+            windows = _windows(log, width, derived)
             fit = estimate_alignment(windows, width)
     configured = configured_scales(config)
     if convention.swapped and corrects:
@@ -263,6 +265,13 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     log = replace(log, **moved) if moved else log
     findings = notes_about(log.name, (*notes, *of_wheels, *of_heading, *of_delays))
     return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, findings)
+
+
+def _windows(log: RobotLog, width_m: float, derived: DerivedHeading | None) -> DriveWindows:
+    """Return the windows of a log, with the smoothed heading where it was estimated."""
+    if derived is None:
+        return windows_of_log(log, width_m)
+    return windows_of_log(log, width_m, derived.smoothed, derived.measured_t)
 
 
 def _name_streams(
@@ -285,7 +294,7 @@ def _name_streams(
         log = derived.apply(log)
     check_streams(log)
     faults = dead_or_copied(log)
-    windows = windows_of_log(log, width_m, None if derived is None else derived.smoothed)
+    windows = _windows(log, width_m, derived)
     free = config.frames.heading == "auto" and derived is None
     alone = derived is not None and log.gyro is None and not log.gyros
     decision = decide_conventions(
@@ -297,7 +306,7 @@ def _name_streams(
             # the heading was estimated with wheels whose sides were exchanged or reversed
             derived = derive_heading(named, width_m)
             named = derived.apply(named)
-        windows = windows_of_log(named, width_m, None if derived is None else derived.smoothed)
+        windows = _windows(named, width_m, derived)
     notes = [
         *faults,
         *convention_notes(Decision(senses, None), corrects=True, mirrored=alone),

@@ -121,6 +121,7 @@ class HeadingEstimate:
     constants, constants_std : (k,) heading and bias at the end, scale error, x [m], delay [s]; then offset, wandering
         error at the end, delay of each absolute heading
     noises : chosen by the likelihood; names of an absolute heading's noises begin with its number
+    seen_t : times of the courses over ground (c,) [s]
     """
 
     t: Floats
@@ -131,6 +132,7 @@ class HeadingEstimate:
     constants: Floats
     constants_std: Floats
     noises: dict[str, float]
+    seen_t: Floats
 
     @property
     def offset(self) -> tuple[float, float]:
@@ -141,6 +143,11 @@ class HeadingEstimate:
     def median_std(self) -> float:
         """Median standard deviation of the smoothed heading [rad]: how good its sources are."""
         return float(np.median(self.smoothed_std))
+
+    @property
+    def common_std(self) -> float:
+        """Upper limit of the standard deviation of the error that all headings share [rad]."""
+        return float(self.smoothed_std.min())
 
     @property
     def median_causal_std(self) -> float:
@@ -162,7 +169,7 @@ def estimate_heading(
     """
     still = _standing(track, turn) if stands else (np.empty(0), np.empty(0))
     noises, guess = USUAL_NOISES, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std)
-    attempt = 0
+    attempt, has_middle = 0, False
     while True:
         courses = measure_courses(track, turn, guess)
         if len(courses.end) < FEWEST_ALIGNMENT_WINDOWS:
@@ -171,9 +178,12 @@ def estimate_heading(
         if attempt:
             # the noises of turn rate and courses are chosen without the absolute headings
             noises = problem.choose(GYRO_NOISES, noises)
-        better = problem.guess(noises)._replace(middle=fit_middle(courses, guess))
+        better = problem.guess(noises)._replace(middle=guess.middle)
         turned = float(np.abs(better.bias - guess.bias).max() * np.median(courses.end - courses.begin))
-        settled = turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S and attempt > 0
+        settled = turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S and has_middle
+        if turned < LARGE_BIAS_RAD:
+            # with a wrong bias the lengths of the courses show the bias, because it bends the path
+            better, has_middle = better._replace(middle=fit_middle(courses, guess)), True
         guess = guess if settled else better
         if settled or attempt == ROUNDS:
             break
@@ -358,5 +368,5 @@ class _Problem:
         smoothed_std = np.sqrt(np.interp(s, t, psi_variance) + stamp)
         return HeadingEstimate(
             s, carried, np.sqrt(np.maximum(variance, 0.0) + stamp), smoothed, smoothed_std,
-            states[-1].copy(), final_std, noises,
+            states[-1].copy(), final_std, noises, t[self.kind == COURSE],
         )  # fmt: skip

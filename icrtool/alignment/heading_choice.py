@@ -17,6 +17,7 @@ from icrtool.alignment.gyro_heading import (
 )
 from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensor_noise import is_hole
+from icrtool.alignment.sparse_reference import are_rare
 from icrtool.alignment.turn_rates import BETTER_SCATTER_RATIO, TurnRate, course_changes, gyro_rates, wheel_rate
 from icrtool.alignment.wheel_alignment import compare_turns
 from icrtool.alignment.wheel_units import refuse_standing
@@ -117,6 +118,8 @@ class DerivedHeading:
     gyro : the turn rate that was used, None if the wheels' turn rate was used
     attitude : the attitude sensor's own heading, corrected by the offset of the estimate; None where none was used
     why : its parts and standard deviation, for the user
+    measured_t : times of courses over ground [s] where fixes are rare and the wheels carry the heading in between; else
+        None
     """
 
     source: str
@@ -127,6 +130,7 @@ class DerivedHeading:
     gyro: GyroSamples | None
     attitude: HeadingSamples | None
     why: str
+    measured_t: Floats | None = None
 
     def apply(self, log: RobotLog) -> RobotLog:
         """Return the log with the causal heading, for the filter, and the turn rate that agrees with it."""
@@ -274,6 +278,7 @@ def _derived(
         GyroSamples(gyro_topic, turn_stamps, turn.rate) if gyro_topic else None,
         attitude,
         f"{', '.join(parts)}; σ {math.degrees(estimate.median_causal_std):.2f}°",
+        None if gyro_topic or not are_rare(track) else estimate.seen_t,
     )
 
 

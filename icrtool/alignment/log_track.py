@@ -15,7 +15,7 @@ from icrtool.alignment.sensor_noise import (
     USUAL_POSITION_STD_M,
     unbroken_intervals,
 )
-from icrtool.alignment.sparse_reference import spans_of_measured, with_carried_heading
+from icrtool.alignment.sparse_reference import spans_of_measured, wheel_path, with_carried_heading
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, in_spans, runs_of, unwrapped
 from icrtool.kernels.track import Track, Windows, cut
@@ -127,14 +127,15 @@ def track_of_streams(
     none = np.zeros(len(fix_t), np.bool_)
     track = Track(
         wheel_t, held, left, right, fix_t, gnss.north_m, gnss.east_m, heading_t, angle, np.zeros(len(fix_t)),
-        none, none, none, place_std_m=fix_std_m(gnss), same_clock=same_clock,
+        none, none, none, same_clock=same_clock,
     )  # fmt: skip
     if len(wheel_t) > MOST_WHEEL_SAMPLES:
         # gaps are not joined with other samples
         begins = (held == 0.0) | np.append(True, held[:-1] == 0.0)
         begins[_thinned(turns)] = begins[-1] = True
         track = track.joined(np.flatnonzero(begins))
-    return with_carried_heading(track._replace(distance=np.interp(fix_t, track.t, track.travel)))
+    track = track._replace(distance=np.interp(fix_t, track.t, track.travel), place_std_m=fix_std_m(gnss, track))
+    return with_carried_heading(track)
 
 
 def _thinned(busy: Bools) -> Ints:
@@ -148,14 +149,18 @@ def _thinned(busy: Bools) -> Ints:
     return np.union1d(moving, even) if len(moving) <= MOST_WHEEL_SAMPLES else even
 
 
-def fix_std_m(gnss: PositionFixes | Fixes) -> float:
+def fix_std_m(gnss: PositionFixes | Fixes, track: Track | None = None) -> float:
     """Return the noise of the fixes on one axis [m]: the stated noise, or the measured one where it is clearly larger.
+
+    Parameters
+    ----------
+    track : of the same fixes, whose wheels explain a part of the motion between rare fixes
 
     Notes
     -----
-    The noise is measured without wheels and heading, whose meaning is not known yet: the second difference of white
-    errors has six times their variance. The robot's motion between fixes adds little where fixes are frequent, and much
-    where they are rare; `FixSteps.white_std_m` leaves the motion out.
+    The noise is measured without a heading, whose meaning is not known yet: the second difference of white errors has
+    six times their variance. The robot's motion between fixes adds little where fixes are frequent. Where they are
+    rare, `wheel_path` leaves out the motion of the wheels.
     """
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known_variance = variance[np.isfinite(variance) & (variance > 0)]
@@ -164,12 +169,23 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
         return stated
     bend = np.sqrt(np.diff(gnss.north_m, 2) ** 2 + np.diff(gnss.east_m, 2) ** 2)
     measured = float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
+    if track is not None and measured > NOISIER * stated and (path := wheel_path(track)) is not None:
+        measured = min(measured, path.noise_m)
     return measured if measured > NOISIER * stated else stated
 
 
-def windows_of_log(log: RobotLog, width_m: float, heading: HeadingSamples | None = None) -> DriveWindows:
-    """Return the windows of the alignment, for a robot of track width b [m]; `heading` replaces the log's own."""
-    return cut_drive_windows(track_of_log(log, heading), min(ALIGNMENT_WINDOW_M, WINDOW_IN_WIDTHS * width_m))
+def windows_of_log(
+    log: RobotLog, width_m: float, heading: HeadingSamples | None = None, measured_t: Floats | None = None
+) -> DriveWindows:
+    """Return the windows of the alignment, for a robot of track width b [m].
+
+    Parameters
+    ----------
+    heading : in place of the log's own; measured_t : times at which it was measured, `Track.measured_t`
+    """
+    track = track_of_log(log, heading)
+    track = track if measured_t is None else track._replace(measured_t=measured_t)
+    return cut_drive_windows(track, min(ALIGNMENT_WINDOW_M, WINDOW_IN_WIDTHS * width_m))
 
 
 def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, length_m: float = 0.0) -> DriveWindows:
@@ -240,6 +256,11 @@ def chord_s(track: Track) -> float:
     return max(CHORD_S, float(np.median(np.diff(track.place_t)))) if len(track.place_t) > 1 else CHORD_S
 
 
+def rows_of_chords(track: Track) -> Ints:
+    """Return the rows of the fixes at which chords begin and end."""
+    return np.unique(np.floor(track.place_t / chord_s(track) + 1e-9), return_index=True)[1]
+
+
 def cut_chords(track: Track) -> tuple[Floats, Complexes, Floats, Floats]:
     """Return spans of `chord_s` of a drive from fix to fix, without a heading.
 
@@ -248,7 +269,7 @@ def cut_chords(track: Track) -> tuple[Floats, Complexes, Floats, Floats]:
     duration (w,) [s]; displacement of the fixes, north + j east; distance of the left and of the right side, with their
     signs [m]
     """
-    rows = np.unique(np.floor(track.place_t / chord_s(track) + 1e-9), return_index=True)[1]
+    rows = rows_of_chords(track)
     left, right = (np.diff(track.at_places(speed)[rows]) for speed in (track.v_left, track.v_right))
     return np.diff(track.place_t[rows]), np.diff(track.place[rows]), left, right
 

@@ -49,6 +49,9 @@ the driven distance with old fixes. Above this share the robot does not move, an
 HOLE_IN_INTERVALS = 5.0
 """Interval between two samples, in usual intervals, above which a stream has a hole."""
 
+SLIP_SHARE = 0.03
+"""Standard deviation of slip from window to window of 2 m, as a share of distance and of turn."""
+
 WHEEL_HOLE_S = 1.0
 """Interval between two wheel samples above which the path between them is not known [s]."""
 

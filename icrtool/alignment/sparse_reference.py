@@ -1,13 +1,15 @@
-"""References with few poses: headings carried between their samples by the wheels, and nodes of interpolated poses."""
+"""References with few poses: headings carried by the wheels, noise of rare fixes, nodes of interpolated poses."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensor_noise import is_hole
-from icrtool.kernels.arrays import Bools, Floats, Ints, wrapped
+from icrtool.alignment.sensor_noise import MEDIAN_OF_RAYLEIGH, SLIP_SHARE, is_hole
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, wrapped
 from icrtool.kernels.track import Track
 from icrtool.records.notes import note
 from icrtool.records.samples import HeadingSamples
@@ -65,12 +67,110 @@ def _turn_per_m(apart: Floats, turn: Floats) -> float | None:
     largest = float(np.abs(apart).max(initial=0.0))
     if len(apart) < FEWEST_CARRIED or largest <= 0.0:
         return None
-    tried = np.arange(-LARGEST_TURN_PER_M, LARGEST_TURN_PER_M, min(0.5 / largest, 0.1))
+    tried = _ratios(largest)
     score = np.array([float(np.cos(turn - ratio * apart).mean()) for ratio in tried.tolist()])
     best = float(tried[int(np.argmax(score))])
     if score.max() < AGREED_COSINE:
         return None
     return best + float(apart @ wrapped(turn - best * apart)) / float(apart @ apart)
+
+
+def are_rare(track: Track) -> bool:
+    """Return whether the fixes of a track are usually more than `SPARSE_S` apart."""
+    return len(track.place_t) > 1 and float(np.median(np.diff(track.place_t))) > SPARSE_S
+
+
+STANDING_SHARE = 0.05
+"""Travel between two fixes below which the robot stands, as a share of the usual travel."""
+
+AVERAGED_S = 0.1
+"""Time over which wheel speeds are averaged for the path between rare fixes [s]."""
+
+STRAIGHT_QUANTILE = 0.9
+"""Quantile of the ratio of displacement to the wheels' travel that straight steps have."""
+
+
+class WheelPath(NamedTuple):
+    """The path of the wheels until each fix, with the ratio of turn to the difference of the sides that fits best.
+
+    Attributes
+    ----------
+    place : (m,) by the wheels, in their unit, with an unknown direction
+    noise_m : of the fixes on one axis [m], beyond the path and slip
+    misfit : median distance of a fix from the place that the two fixes before it and the path give, over the step
+    """
+
+    place: Complexes
+    noise_m: float
+    misfit: float
+
+
+def wheel_path(track: Track) -> WheelPath | None:
+    """Return the path of the wheels between rare fixes; None where fixes are frequent, or too few.
+
+    Notes
+    -----
+    Of three fixes in a row, the second step is expected to be the first one times S_2 / S_1, with the steps S of the
+    wheels. The expectation depends neither on the heading nor on the unit of the wheels. One ratio of turn to the
+    difference of the sides is tried after the other, each also for wheels of which one side is reversed.
+    """
+    step_s = np.diff(track.place_t)
+    if len(step_s) < FEWEST_CARRIED or not are_rare(track):
+        return None
+    track = _averaged_wheels(track)
+    gone, seen = np.diff(track.at_places(np.abs(track.v_left) + np.abs(track.v_right))) / 2.0, np.diff(track.place)
+    moves = gone > STANDING_SHARE * float(np.median(gone))
+    usable = (step_s[:-1] < LONGEST_CARRIED_S) & (step_s[1:] < LONGEST_CARRIED_S) & moves[:-1] & moves[1:]
+    usable &= track.clear(track.place_t[:-2], track.place_t[2:])
+    if np.count_nonzero(usable) < FEWEST_CARRIED:
+        return None
+    metres = float(np.quantile(np.abs(seen[moves]) / gone[moves], STRAIGHT_QUANTILE))
+    best, least = None, math.inf
+    for ahead, apart in ((track.mean_speed, track.half_difference), (track.half_difference, track.mean_speed)):
+        total = 2.0 * track.cumulate(apart)
+        middle, turned = total + apart * track.held, np.abs(np.diff(np.interp(track.place_t, track.t, total)))
+        largest = metres * float(turned.max())
+        if not math.isfinite(largest):
+            return None
+        for ratio in (metres * _ratios(largest)).tolist():
+            place = np.asarray(track.at_places(ahead * np.exp(1j * ratio * middle)), np.complex128)
+            gain, away = _third_fixes(place, track.place, usable)
+            misfit = float(np.median(np.abs(away) / (1.0 + np.abs(gain))))
+            if misfit < least:
+                turns = 1.0 + abs(ratio) * (turned[1:] + turned[:-1])
+                slip_m = SLIP_SHARE * metres * (gone[1:] * turns)[usable]
+                # the variance of p_3 - p_2 - gain (p_2 - p_1) by white noise, in variances of a fix
+                spread = np.sqrt(1.0 + np.abs(1.0 + gain) ** 2 + np.abs(gain) ** 2)
+                beyond = np.sqrt(np.maximum(np.abs(away) ** 2 - slip_m**2, 0.0)) / spread
+                least, best = misfit, (place, float(np.median(beyond)) / MEDIAN_OF_RAYLEIGH)
+    return None if best is None else WheelPath(*best, least / max(float(np.median(np.abs(seen[moves]))), 1e-9))
+
+
+def _averaged_wheels(track: Track) -> Track:
+    """Return a track with the wheel samples averaged over `AVERAGED_S`; gaps are kept."""
+    every = round(AVERAGED_S / max(float(np.median(track.held)), 1e-3))
+    if every < 2:
+        return track
+    begins = np.append(True, track.held[:-1] == 0.0) | (track.held == 0.0)
+    begins[::every] = begins[-1] = True
+    return track.joined(np.flatnonzero(begins))
+
+
+def _third_fixes(path: Complexes, place: Complexes, usable: Bools) -> tuple[Complexes, Complexes]:
+    """Return the ratio of the second step to the first by a path, and how far the third fix lies from its place [m].
+
+    Parameters
+    ----------
+    path, place : (m,) by the wheels and by the fixes; usable : (m - 2,) triples that are returned
+    """
+    first, second = np.diff(path)[:-1][usable], np.diff(path)[1:][usable]
+    gain = second / np.where(np.abs(first) > 0.0, first, np.inf)
+    return gain, np.diff(place)[1:][usable] - gain * np.diff(place)[:-1][usable]
+
+
+def _ratios(largest_m: float) -> Floats:
+    """Return ratios of turn to the difference of the sides to try [rad/m], for differences up to `largest_m`."""
+    return np.arange(-LARGEST_TURN_PER_M, LARGEST_TURN_PER_M, min(0.5 / max(largest_m, 1e-9), 0.1))
 
 
 def spans_of_measured(measured_t: Floats, least_s: float, intervals: int) -> tuple[Floats, Floats]:

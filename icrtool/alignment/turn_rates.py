@@ -21,7 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensor_noise import JUMP_SIGMAS, is_hole
+from icrtool.alignment.log_track import ALIGNMENT_WINDOW_M
+from icrtool.alignment.sensor_noise import JUMP_SIGMAS, SLIP_SHARE, is_hole
 from icrtool.kernels.arrays import Complexes, Floats, Ints, trapezoids, wrapped
 from icrtool.kernels.robust import mad_std, robust_regression, soft_l1_weights
 from icrtool.kernels.track import Track
@@ -40,8 +41,16 @@ FIXES_A_WINDOW = 5
 """Smallest usual number of fixes in a window. Windows share no fix, so that their errors are independent; with fewer
 fixes most of the distance between windows would be lost."""
 
+LONG_WINDOW = 2.0
+"""Length of a window of `FIXES_A_WINDOW` fixes, in lengths, above which fixes are rare. Windows then share their first
+and last fix: the noise of this fix has a small effect on the direction of so long a window."""
+
 MIDDLE_NOISE = 0.01
 """Smallest spread of the sides' relative speed difference that shows `Guess.middle`, even with exact courses."""
+
+MIDDLE_STD = 0.1
+"""Prior standard deviation of `Guess.middle` about 0, because robots are symmetric: an antenna 0.1 m off the middle of
+ICRs that are 1 m apart has 0.2."""
 
 LONGEST_STRETCH_S = 60.0
 """Longest duration of two displacements, and longest time between them, to compare them without a turn rate [s]."""
@@ -135,7 +144,8 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     v, u = track.mean_speed, track.half_difference
     middle = track.t + track.held / 2
     psi = np.interp(middle, turn.t, corrected)
-    nose = np.exp(1j * psi) * track.held
+    unit = np.exp(1j * psi)
+    nose = unit * track.held
     step = (v + guess.middle * u) * nose
     span = max(track.t[0], turn.t[0]), min(track.t[-1], turn.t[-1])
     length, t, place, begin, end = _cut_courses(track._replace(place_t=track.place_t - guess.delay_s), *span)
@@ -170,26 +180,48 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     of_x, of_delay = (product(centred(-one)).imag / square for one in (swing, speed * swing))
     of_bias = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
     of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
+    chord = laid_path[end] - laid_path[begin]
+    travel, doubled = (laid(np.abs(v) * one) for one in (np.asarray(track.held, np.complex128), nose * unit))
+    slip_std = _slip_std(chord, (travel[end] - travel[begin]).real, doubled[end] - doubled[begin])
+    std = np.hypot(track.place_std_m / np.sqrt(square), slip_std)
     # The angle is stated for zero bias, zero x_icr and zero delay.
     bias_at = np.interp(t[end], turn.t, guess.bias)
     angle = np.angle(displacement * swing[end]) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
     courses = Courses(
-        t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, track.place_std_m / np.sqrt(square),
+        t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, std,
         np.abs(displacement), product(centred(laid(u * nose))).real / square,
     )  # fmt: skip
     return Courses(*(values[usable] for values in courses))
 
 
+def _slip_std(chord: Complexes, gone_m: Floats, doubled: Complexes) -> Floats:
+    """Return the standard deviation of the direction of displacements (w,) by slip that varies within them [rad].
+
+    Slip of `SLIP_SHARE` in each `ALIGNMENT_WINDOW_M` of travel moves the end by this share of the travel to the side of
+    the chord. Slip that is the same in all of a displacement does not turn it.
+
+    Parameters
+    ----------
+    chord : by the wheels [m]; gone_m : travel; doubled : integral of the speed along twice the heading [m]
+    """
+    size = np.maximum(np.abs(chord), 1e-12)
+    aside_m = np.maximum(gone_m - (doubled * np.conj(chord / size) ** 2).real, 0.0) / 2.0
+    varies = np.clip(1.0 - ALIGNMENT_WINDOW_M / np.maximum(gone_m, 1e-9), 0.0, 1.0)
+    return np.asarray(SLIP_SHARE * np.sqrt(ALIGNMENT_WINDOW_M * varies * aside_m) / size)
+
+
 def fit_middle(courses: Courses, guess: Guess) -> float:
     """Return `Guess.middle` from the lengths of the courses: robust regression on the difference of the sides."""
     x, y = courses.of_middle, courses.length
-    slope, weights = 0.0, np.ones(len(x))
+    slope, weights, prior = 0.0, np.ones(len(x)), 0.0
     for _ in range(3):
         mean_x, mean_y = np.average(x, weights=weights), np.average(y, weights=weights)
-        spread = float((weights * (x - mean_x) ** 2).sum())
-        slope = float((weights * (x - mean_x) * (y - mean_y)).sum()) / (spread + len(x) * MIDDLE_NOISE**2)
+        spread = float((weights * (x - mean_x) ** 2).sum()) + len(x) * MIDDLE_NOISE**2
+        slope = float((weights * (x - mean_x) * (y - mean_y)).sum()) - prior * guess.middle
+        slope /= spread + prior
         residuals = y - mean_y - slope * (x - mean_x)
-        weights = soft_l1_weights(residuals / max(mad_std(residuals, 0.0), 1e-6))
+        scale = max(mad_std(residuals, 0.0), 1e-6)
+        weights, prior = soft_l1_weights(residuals / scale), (scale / MIDDLE_STD) ** 2
     return guess.middle + slope
 
 
@@ -229,12 +261,33 @@ def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Fl
         spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
         kept = np.concatenate([[True], ~spike, [True]])
         t, place = t[kept], place[kept]
-    cell = np.floor(np.interp(t, track.t, track.cumulate(np.abs(track.mean_speed))) / length)
+    gone = np.interp(t, track.t, track.cumulate(np.abs(track.mean_speed)))
+    step = np.diff(gone)
+    if FIXES_A_WINDOW * float(np.median(step[step > 0.0] if (step > 0.0).any() else 0.0)) > LONG_WINDOW * length:
+        rows, begin, end = _windows_of_rare(gone, length)
+        return length, t[rows], place[rows], begin, end
+    cell = np.floor(gone / length)
     edges = [0]
     for row in (np.flatnonzero(np.diff(cell) > 0) + 1).tolist():
         if row - edges[-1] >= FIXES_A_WINDOW:
             edges.append(row)
     return length, t, place, np.array(edges[:-1], np.int64), np.array(edges[1:], np.int64) - 1
+
+
+def _windows_of_rare(gone_m: Floats, length_m: float) -> tuple[Ints, Ints, Ints]:
+    """Return rows of fixes, each shared fix twice, and where among them windows of at least a length begin and end.
+
+    Parameters
+    ----------
+    gone_m : (m,) driven distance at the fixes
+    """
+    edges = [0]
+    for row in range(1, len(gone_m)):
+        if gone_m[row] - gone_m[edges[-1]] >= length_m:
+            edges.append(row)
+    count = np.diff(edges) + 1
+    end = np.cumsum(count) - 1
+    return np.arange(int(count.sum())) - np.repeat(np.arange(len(count)), count), end + 1 - count, end
 
 
 WHEEL_TURN, WHEEL_SCALE_STD = 0.6, 0.5

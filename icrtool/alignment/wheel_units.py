@@ -15,13 +15,16 @@ import numpy as np
 
 from icrtool.alignment.estimator import EVIDENCE_SIGMAS
 from icrtool.alignment.log_track import (
+    CHORD_S,
     FEWEST_ALIGNMENT_WINDOWS,
     LEAST_CHORD_M,
     DriveWindows,
     chord_s,
     cut_chords,
+    rows_of_chords,
     track_of_streams,
 )
+from icrtool.alignment.sparse_reference import wheel_path
 from icrtool.config import Config, builtin_robots
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -31,6 +34,9 @@ from icrtool.records.run import ROLLING_SCALE
 from icrtool.records.samples import NO_HEADINGS, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
+
+WELL_FITTED = 0.1
+"""Largest misfit of the wheels' path between rare fixes at which its length is compared, `WheelPath.misfit`."""
 
 STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
 """Spans in which the distances of wheels and position reference are compared: largest relative difference of the sides
@@ -282,7 +288,8 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     Notes
     -----
     Straight spans are used where there are enough, else bent ones. The chords of bent spans are converted to arcs with
-    the directions of the chords before and after. The signs of the wheel speeds have no effect.
+    the directions of the chords before and after. Between rare fixes the robot may turn to both sides: there the chords
+    of `wheel_path` are used. The signs of the wheel speeds have no effect.
     `icrtool.alignment.estimator` cannot be used, because it needs m/s and a heading, which are found later.
     """
     if min(len(stamps), len(gnss.stamp_ns)) < 2:
@@ -293,7 +300,12 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     distance, turn = (left + right) / 2, np.abs(left - right)
     usable = (np.abs(duration - usual_s) < usual_s / 4) & (chord > LEAST_CHORD_M) & (distance > 0)
     straight = usable & (turn < STRAIGHT * distance)
-    if np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:
+    path = wheel_path(track) if usual_s > CHORD_S else None
+    if path is not None and path.misfit < WELL_FITTED:
+        by_path = np.abs(np.diff(path.place[rows_of_chords(track)]))
+        straight = usable & (by_path > distance / 2)
+        distance = by_path
+    elif np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:
         bend = np.full(len(chord), np.inf)
         bend[1:-1] = np.abs(np.angle(step[2:] * np.conj(step[:-2]))) / 2
         enclosed = usable.copy()

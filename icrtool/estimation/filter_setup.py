@@ -180,7 +180,7 @@ def set_up_filter(
     first_state = float(wheel_t[np.searchsorted(wheel_t, t0)])
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
     parameters = _parameters(config, data, sensors, noise or configured_noise(config))
-    x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
+    x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start, corrects=config.filter.rules.corrects)
     return FilterSetup(data, t0, x0, P0, parameters)
 
 
@@ -243,8 +243,15 @@ def _start_state(
     icrs: tuple[Floats, Floats],
     parameters: FilterParameters,
     warm_start: WarmStart | None,
+    *,
+    corrects: bool,
 ) -> tuple[Floats, Floats]:
-    """Return state (6,) and covariance (6, 6) at the start `t0` [s]; `icrs`: initial ICRs and standard deviations."""
+    """Return state (6,) and covariance (6, 6) at the start `t0` [s].
+
+    Parameters
+    ----------
+    icrs : initial ICRs and standard deviations; corrects : False takes the last fix as the position at the start
+    """
     fix = int(np.searchsorted(data.gnss_t, t0, side="right")) - 1
     sample = int(np.searchsorted(data.heading_t, t0, side="right")) - 1
     psi = math.remainder(float(data.heading_z[sample]), 2 * math.pi)
@@ -253,10 +260,19 @@ def _start_state(
     east = data.gnss_z[fix, 1] - (forward * math.sin(psi) + right * math.cos(psi))
     x0 = np.array([north, east, psi, *icrs[0]])
     P0 = np.diag([*data.gnss_r[fix], data.heading_r[sample], *(icrs[1] ** 2)])
+    if corrects:
+        # the robot has driven since its last fix, in a direction that is not known yet
+        P0[[0, 1], [0, 1]] += _travel_m(data, float(data.gnss_t[fix]), t0) ** 2
     if warm_start is not None:
         _check_warm_start(warm_start)
         x0[3:], P0[3:, 3:] = warm_start.icrs_m, warm_start.covariance_m2
     return x0, P0
+
+
+def _travel_m(data: FilterInputs, begin_s: float, end_s: float) -> float:
+    """Return the mean distance of the sides between two times [m]."""
+    edges = np.clip(np.append(data.wheel_t, math.inf), begin_s, end_s)
+    return float(np.diff(edges) @ (np.abs(data.v_left) + np.abs(data.v_right))) / 2.0
 
 
 def _check_warm_start(start: WarmStart) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from icrtool.alignment.sensor_noise import SLIP_SHARE
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, rows_at_steps
 from icrtool.kernels.filter_records import REFERENCE_STEP_S
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
@@ -69,6 +70,7 @@ class StateWindows(Windows):
     distance_m : distance of the wheels in the whole drive
     separation_m : y right - y left of the ICRs that convert the wheels' motion
     noise : (3,) standard deviation of each kind of residual by the noise of the states
+    heading_std_rad : standard deviation of the error that all headings share
     """
 
     residuals: Floats
@@ -79,9 +81,12 @@ class StateWindows(Windows):
     distance_m: float
     separation_m: float
     noise: Floats
+    heading_std_rad: float
 
 
-def cut_states(table: States, track: Track, track_width_m: float | None) -> StateWindows:
+def cut_states(
+    table: States, track: Track, track_width_m: float | None, heading_std_rad: float = 0.0
+) -> StateWindows:  # fmt: skip
     """Return consecutive windows of states, with the motion of the wheels by constant ICRs.
 
     The ICRs are the final ICRs of the run if they are possible, else ICRs from the track width.
@@ -91,6 +96,7 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
     table : the recorded states
     track : track of the same states
     track_width_m : track width b; None if it is not known
+    heading_std_rad : standard deviation of the error that all headings share
     """
     right, left, x = table.icrs_at(-1)
     half = width_or_usual_m(track_width_m) / 2
@@ -126,12 +132,18 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
         distance_m=whole_m,
         separation_m=separation_m,
         noise=math.sqrt(2.0) * np.array([place_std_m, place_std_m, float(np.median(table.std_heading_rad))]),
+        heading_std_rad=heading_std_rad,
     )
 
 
-def prior_std(width_m: float) -> Floats:
-    """Return the standard deviations (6,) of the parameters in `StateWindows.jacobian` before a drive."""
-    return np.array([width_m, width_m, width_m, HEADING_BIAS_RAD, SCALE_ERROR, SCALE_ERROR])
+def prior_std(width_m: float, heading_std_rad: float = 0.0) -> Floats:
+    """Return the standard deviations (6,) of the parameters in `StateWindows.jacobian` before a drive.
+
+    Parameters
+    ----------
+    width_m : of the y ICRs; heading_std_rad : of the error that all headings share, where it is known
+    """
+    return np.array([width_m, width_m, width_m, max(HEADING_BIAS_RAD, heading_std_rad), SCALE_ERROR, SCALE_ERROR])
 
 
 def final_covariance(
@@ -183,7 +195,7 @@ def final_covariance(
     memory_m = float(np.trace(filter_covariance)) / 3.0 / forgets if forgets > 0.0 else math.inf
     weight = np.tile(np.exp((windows.end_m - windows.end_m[-1]) / memory_m)[is_recent], 3)
     direction, rows = np.repeat(np.arange(3), np.count_nonzero(is_recent)), np.tile(is_recent, 3)
-    residuals, prior = windows.residuals[rows], np.diag(prior_std(width_m) ** -2.0)
+    residuals, prior = windows.residuals[rows], np.diag(prior_std(width_m, windows.heading_std_rad) ** -2.0)
     scale = np.hypot(scale_by_kind(residuals, direction), windows.noise[direction]) / np.sqrt(weight)
     at_final_icrs = Linearised(residuals=residuals, jacobian=windows.jacobian[rows], scale=scale, prior=prior)
     slip = 1.0 if track_width_m is None else min(max(abs(width_m / track_width_m - 1.0) / SLIPS, LEAST_SLIP), 1.0)
@@ -199,9 +211,6 @@ def multiplier_std(covariance: Floats, track_width_m: float) -> float:
 
 SPIN_BOTH = "drive two full turns on the spot to the right and two to the left"
 """Advice for a drive with too few turns."""
-
-SLIP_SHARE = 0.03
-"""Standard deviation of slip from window to window, as a share of distance and of turn."""
 
 SHOWN_SHARE, WEAK_SHARE = 0.03, 0.1
 """Largest standard deviations of an ICR that is shown, and of an ICR that is weakly shown, as a share of y right - y
@@ -243,7 +252,7 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
     track, width = windows.track, windows.separation_m
     slip = SLIP_SHARE * np.abs([windows.length_m, windows.length_m, windows.turned_rad])
     rows = windows.jacobian / np.hypot(slip, np.maximum(windows.noise, 1e-6)[:, None]).ravel()[:, None]
-    information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
+    information = rows.T @ rows + np.diag(prior_std(width, windows.heading_std_rad) ** -2.0)
     std: Floats = np.sqrt(np.diag(np.linalg.solve(information, np.eye(6)))[:3])
     turns, spins = _turns(track, width)
     turned_right, spun_to_right = (float(angles.clip(min=0.0).sum()) for angles in (turns, turns[spins]))

@@ -33,7 +33,7 @@ from icrtool.estimation.run_warnings import (
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
+from icrtool.records.measurements import Fixes, LogFacts, Measurements, ReferenceJump, SlipEvent
 from icrtool.records.notes import Note, note, notes_about, unusable_because, warnings_of
 from icrtool.records.plain_data import finite_or_none
 from icrtool.records.requests import FitRequest
@@ -88,7 +88,7 @@ def summarise(
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
-    covariance, excitation, x_clock_std_m = assess_icrs(filtered, config, sensors.facts.clock_std_s)
+    covariance, excitation, x_clock_std_m = assess_icrs(filtered, config, sensors.facts)
     multiplier = None if width is None else (separation_multiplier(table, width), multiplier_std(covariance, width))
     inverted, rejected = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]), _rejected_shares(filtered)
     unusable = _unusable_reasons(
@@ -233,16 +233,13 @@ def _spans(stamps_ns: Ints) -> Spans:
     return tuple((int(begin), int(end)) for begin, end in stamps_ns)
 
 
-def assess_icrs(
-    filtered: Filtered, config: Config, clock_std_s: float = 0.0
-) -> tuple[Floats, ExcitationDocument, float]:
+def assess_icrs(filtered: Filtered, config: Config, facts: LogFacts) -> tuple[Floats, ExcitationDocument, float]:
     """Return the covariance of the final ICRs, the ICRs that the drive shows, and the clocks' part of the std of x_icr.
 
     Parameters
     ----------
     filtered, config : result of the filter, and the configuration
-    clock_std_s : standard deviation of the time between position and heading. A lag of positions has the same effect as
-        an x_icr further back
+    facts : of the log. A lag of positions behind headings has the same effect as an x_icr further back
 
     Returns
     -------
@@ -256,7 +253,8 @@ def assess_icrs(
     """
     table, width = filtered.table, config.robot.track_width_m
     track = track_of_states(table, filtered.in_gap, filtered.outages_ns)
-    windows, filter_covariance = cut_states(table, track, width), filtered.covariance[3:, 3:]
+    windows = cut_states(table, track, width, facts.heading_common_std_rad)
+    filter_covariance = filtered.covariance[3:, 3:]
     if config.filter.rules.final_of_filter:
         return filter_covariance, find_excitation(windows, {}), 0.0
     covariance = final_covariance(
@@ -267,7 +265,7 @@ def assess_icrs(
         since_s=max((t for t in filtered.changes_s if t < table.t_s[-1]), default=0.0),
     )
     unlearned = unlearned_icrs(table, std_m=np.sqrt(np.diag(covariance)), least_icr_m=filtered.least_icr_m)
-    x_clock_std_m = abs(_speed_while_turning(table)) * clock_std_s
+    x_clock_std_m = abs(_speed_while_turning(table)) * facts.clock_std_s
     covariance_of_all = covariance + np.diag([0.0, 0.0, x_clock_std_m**2])
     return covariance_of_all, find_excitation(windows, unlearned), x_clock_std_m
 

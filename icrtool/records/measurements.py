@@ -85,6 +85,7 @@ class LogFacts(Record, frozen=True, kw_only=True):
     antenna_m : position of the antenna from the body origin, forward and right [m]
     antenna_is_known : the position of the antenna was configured, or is in the log
     clock_std_s : standard deviation of the time between position and heading, after the correction of delays
+    heading_common_std_rad : standard deviation of the error that all estimated headings share [rad]; 0: not estimated
     heading_sensor : topic of the log that states a heading, also where it is fused with others; None without one
     """
 
@@ -96,6 +97,7 @@ class LogFacts(Record, frozen=True, kw_only=True):
     antenna_m: tuple[float, float]
     antenna_is_known: bool = False
     clock_std_s: float = 0.0
+    heading_common_std_rad: float = 0.0
     heading_sensor: HeadingSensor | None = None
 
     @property
