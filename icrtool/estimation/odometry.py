@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, trapezoids
 from icrtool.kernels.kinematics import chord_rows
 from icrtool.kernels.open_loop import open_loop_pieces
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath
-from icrtool.records.measurements import MeasuredHeading, ReferenceJump
+from icrtool.records.measurements import MeasuredHeading, ReferenceJump, SensorData
 from icrtool.records.run import Run, no_slip_icrs, track_of_states
 from icrtool.records.run_document import DriveDocument
 from icrtool.records.tables import States
@@ -151,19 +151,73 @@ def _without_jumps(table: States, jumps: Iterable[ReferenceJump]) -> tuple[Float
     return north, east
 
 
-def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDocument:
+class GapPaths(NamedTuple):
+    """The gaps in the wheel data of a run, and the paths in them.
+
+    Attributes
+    ----------
+    row : (g,) rows of the states at their begins
+    beyond_m : (g,) length of the path through the fixes in each gap, minus the chord from state to state [m]
+    unseen_s, unseen_m : duration of the gaps without a fix in which the robot moved, and the straight distance there
+    """
+
+    row: Ints
+    beyond_m: Floats
+    unseen_s: float
+    unseen_m: float
+
+
+def measure_gaps(table: States, in_gap: Bools, sensors: SensorData, used: Bools) -> GapPaths:
+    """Return the paths in the gaps of the wheel data, from the fixes there.
+
+    Parameters
+    ----------
+    table, in_gap : states (n,), and which of them begin a gap
+    sensors : of the run; used : (m,) fixes that the filter used
+    """
+    rows, seen = np.flatnonzero(in_gap), sensors.fixes.cut(used)
+    forward, right = sensors.facts.antenna_m
+    heading = np.interp(seen.stamp_ns, sensors.headings.stamp_ns, unwrapped(sensors.headings.heading_rad))
+    body = seen.north_m + 1j * seen.east_m - (forward + 1j * right) * np.exp(1j * heading)
+    step_m = max(SHORTEST_STEP_M, STEP_IN_STD * float(np.sqrt(np.median(seen.var_north_m2 + seen.var_east_m2))))
+    place, beyond_m, unseen_s, unseen_m = table.north_m + 1j * table.east_m, np.zeros(len(rows)), 0.0, 0.0
+    for gap, row in enumerate(rows.tolist()):
+        first, last = np.searchsorted(seen.stamp_ns, table.stamp_ns[row : row + 2], side="right").tolist()
+        if last > first:
+            path = np.concatenate([place[row : row + 1], body[first:last], place[row + 1 : row + 2]])
+            chosen = chord_rows(path.real.copy(), path.imag.copy(), step_m)
+            length = np.abs(np.diff(path[chosen])).sum() + np.abs(path[-1] - path[chosen[-1]])
+            beyond_m[gap] = max(float(length - np.abs(place[row + 1] - place[row])), 0.0)
+        elif last < len(body):
+            # the filter follows the robot at the first fix after the gap
+            after = int(np.searchsorted(table.stamp_ns, seen.stamp_ns[last]))
+            driven = float(table.distance_m[min(after, len(table) - 1)] - table.distance_m[row + 1])
+            moved = float(np.abs(body[last] - place[row])) - driven
+            noise = math.hypot(float(table.std_north_m[row]), float(table.std_east_m[row]))
+            if moved > max(step_m, STEP_IN_STD * noise):
+                unseen_s, unseen_m = unseen_s + float(table.t_s[row + 1] - table.t_s[row]), unseen_m + moved
+    return GapPaths(rows, beyond_m, unseen_s, unseen_m)
+
+
+NO_GAPS = GapPaths(np.empty(0, np.int64), np.empty(0), 0.0, 0.0)
+"""Paths of a drive without gaps."""
+
+
+def drive_summary(table: States, jumps: Iterable[ReferenceJump] = (), gaps: GapPaths = NO_GAPS) -> DriveDocument:
     """Return duration, distance of the positions, and mean and standard deviation of the speed over time.
 
     Parameters
     ----------
     table : the recorded states
     jumps : jumps of the reference; their length does not count as driven
+    gaps : paths in the gaps of the wheel data
 
     Notes
     -----
     The distance is the sum of chords between positions. A chord is longer than the noise of the positions, so that a
     parked robot has no distance, and a spin on the spot has none. Within a chord the speed follows the model; it is
-    constant if the model shows less than half of the chord.
+    constant if the model shows less than half of the chord. In a gap of the wheel data there is no state, and the path
+    through the fixes counts.
     """
     interval, duration = np.diff(table.t_s), float(table.t_s[-1])
     noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m), overwrite_input=True))
@@ -173,6 +227,8 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
     if rows[-1] != len(table) - 1:
         # The rest at the end is shorter than a chord and does not count.
         rows, chords = np.append(rows, len(table) - 1), np.append(chords, 0.0)
+    if len(gaps.row) and len(chords):
+        np.add.at(chords, np.searchsorted(rows, gaps.row, side="right") - 1, gaps.beyond_m)
     distance = float(chords.sum())
     modelled, lasted = np.diff(table.distance_m[rows]), np.diff(table.t_s[rows])
     # The model stands still in a gap of the wheel data.

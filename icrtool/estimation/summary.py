@@ -20,7 +20,7 @@ from icrtool.estimation.observability import (
     multiplier_std,
     unlearned_icrs,
 )
-from icrtool.estimation.odometry import OdometryName, drive_summary, drive_wheels, odometry_icrs
+from icrtool.estimation.odometry import OdometryName, drive_summary, drive_wheels, measure_gaps, odometry_icrs
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import (
     antenna_warning,
@@ -98,6 +98,13 @@ def summarise(
         measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance,
         rejected, inverted=inverted,
     )  # fmt: skip
+    gaps = measure_gaps(table, filtered.in_gap, sensors, filtered.gnss.used)
+    if gaps.unseen_m > 0.0:
+        why = (
+            f"the driven distance is a lower limit: for {gaps.unseen_s:.1f} s the log has neither wheel samples nor "
+            f"positions, and the {gaps.unseen_m:.1f} m between their ends are counted"
+        )
+        notes = (*notes, note("distance_is_lower_limit", why, sensors.name))
     notes = (*notes, *notes_about(sensors.name, unusable))
     hidden = () if config.filter.rules.final_of_filter else excitation.verdict.not_shown
     return RunDocument(
@@ -111,7 +118,7 @@ def summarise(
         notes=notes,
         warnings=warnings_of(notes),
         alignment=measurements.findings,
-        drive=drive_summary(table, sensors.jumps),
+        drive=drive_summary(table, sensors.jumps, gaps),
         usable=not unusable,
         unusable_because=unusable_because(notes),
         icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, multiplier, hidden),

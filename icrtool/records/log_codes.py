@@ -265,6 +265,12 @@ OF_WHEELS: dict[str, Explanation] = {
         "The distance that the positions show is driven at constant speed in the gaps.",
         "None is needed. Look for messages lost by the recorder.",
     ),
+    "distance_is_lower_limit": Explanation(
+        "info",
+        "In a gap, wheel samples and positions are missing, and the robot is in another place after it.",
+        "The path in the gap is at least as long as the straight line that is counted.",
+        "None is needed for the ICRs. Look for messages lost by the recorder.",
+    ),
     "wheel_values_held": Explanation(
         "warning",
         "Wheel values repeat the one before while the robot moves: the driver sends faster than it measures.",
