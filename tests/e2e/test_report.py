@@ -105,11 +105,11 @@ def test_a_report_that_was_edited_is_refused_in_one_line(icrtool: Command, run_d
         file.write_bytes(kept)
 
 
-@pytest.mark.parametrize("place", ["nothing-here", "."])
-def test_what_is_no_result_has_no_page(icrtool: Command, place: str) -> None:
+@pytest.mark.parametrize(("place", "why"), [("nothing-here", "no such file"), (".", "holds no run")])
+def test_what_is_no_result_has_no_page(icrtool: Command, place: str, why: str) -> None:
     status, _, errors = icrtool("report", place)
     assert status == 1
-    assert errors.startswith(f"Error: {place}: no ")
+    assert errors.startswith(f"Error: {place}: {why}")
 
 
 @pytest.mark.usefixtures("without_drawing")
