@@ -1,8 +1,8 @@
 """Decoder of CDR and ROS 1 messages by their shapes.
 
-The messages of a topic are alike: most have sequences and texts of the same lengths as the message before. A layout's
-program runs, as plain Python, over one message of each shape; the numbers of all messages of that shape are then
-gathered at once. Messages that are like no other are decoded one by one.
+Messages have the same shape if their sequences and texts have the same lengths; most messages of a topic do. A layout's
+program runs, as plain Python, over one message of each shape. Then the numbers of all messages of that shape are
+gathered at once. A message with a shape of its own is decoded alone.
 """
 
 from __future__ import annotations
@@ -37,33 +37,33 @@ _SHAPES_AT_ONCE = 1 << 10
 """Largest number of shapes of messages that are decoded at once."""
 
 _COMPARED_SHAPES = 1 << 8
-"""Largest number of shapes with which a message is compared."""
+"""Largest number of known shapes with which a message is compared."""
 
 _TRIED_SHAPES = 1 << 4
-"""Smallest number of shapes with which a message is compared."""
+"""Number of known shapes with which a message is compared, even where few messages have the same shape."""
 
 _MOST_LENGTHS = 512
-"""Largest number of lengths in a message that are compared; a message with more lengths is a shape of its own."""
+"""Largest number of lengths in a message that are compared; a message with more lengths has a shape of its own."""
 
 _STEPS_PER_BYTE = 4
-"""Number of steps of the program that one message may take for each of its bytes. Loops over elements of size zero
-would never end."""
+"""Number of steps of the program that one message may take for each of its bytes. Without this limit a loop over
+elements of size zero would not end."""
 
 _LEAST_STEPS = 256
 """Number of steps of the program that a message of size zero may take."""
 
 _MOST_STEPS = 1 << 22
-"""Largest number of steps of the program that one message of any size may take, about a second."""
+"""Largest number of steps of the program that one message of any size may take. They take about a second."""
 
 _CDR_LITTLE, _CDR_BIG = 1, 0
 
 
 MOST_TEXTS = 4096
-"""Largest number of different texts of a field, as names of joints: one text for each message would take ten times the
-time and memory."""
+"""Largest number of different texts of a field, such as the names of joints. A different text in each message would
+take ten times the time and memory."""
 
 FURTHER = "…".encode()
-"""Text in place of all further texts of a field."""
+"""Text that replaces all texts of a field beyond `MOST_TEXTS`."""
 
 
 class _UnreadableError(Exception):
@@ -71,22 +71,22 @@ class _UnreadableError(Exception):
 
 
 class Shape(NamedTuple):
-    """What messages of the same shape share; all offsets are from the begin of the message.
+    """Properties that all messages of one shape have; offsets count from the first byte of the message.
 
     Attributes
     ----------
     readable : whether the messages fit their layout
-    size : least number of bytes of such a message; an unreadable message has exactly this number
-    same : offset and content of the bytes that such messages share; None where they are too many to compare
+    size : smallest size of a message of this shape [bytes]; unreadable messages have exactly this size
+    same : offset and content of the bytes that decide the shape; None where they are too many to compare
     big : whether numbers are big-endian
-    taken : by slot the offset of each number, or offset and length of each text
+    places : for each slot the offset of each number, or the offset and length of each text
     """
 
     readable: bool
     size: int
     same: tuple[tuple[int, bytes], ...] | None
     big: bool
-    taken: list[list[Any]]
+    places: list[list[Any]]
 
     def fits(self, message: bytes) -> bool:
         """Return whether a message has this shape."""
@@ -96,16 +96,16 @@ class Shape(NamedTuple):
         return all(message.startswith(content, at) for at, content in same)
 
 
-class _Run:
-    """A run of a layout's program over one message."""
+class _ShapeReader:
+    """Interpreter of a layout's program: it runs over one message and finds the shape of the message."""
 
     def __init__(self, layout: Layout, message: bytes) -> None:
         self._message, self._stop, self._cdr = message, len(message), layout.cdr
         self._base = self._at = 4 if layout.cdr else 0
         self._steps_left = min(_STEPS_PER_BYTE * len(message) + _LEAST_STEPS + 2 * len(layout.program), _MOST_STEPS)
-        # the ranges that decide the shape: encapsulation and lengths; adjacent ranges are joined
+        # Encapsulation and lengths decide the shape; adjacent ranges of these bytes are joined.
         self._same, self._lengths = [[0, self._base]], 0
-        self._taken: list[list[Any]] = [[] for _ in range(layout.taken)]
+        self._places: list[list[Any]] = [[] for _ in range(layout.slot_count)]
         self._big, readable = False, True
         try:
             if layout.cdr:
@@ -113,7 +113,7 @@ class _Run:
                     raise _UnreadableError
                 self._big = message[1] == _CDR_BIG
             self._unpack = Struct(">I" if self._big else "<I").unpack_from
-            self._program(layout.program, taking=True)
+            self._run_program(layout.program, wanted=True)
         except _UnreadableError:
             readable = False
         same = tuple((begin, message[begin:end]) for begin, end in self._same if message[begin:end])
@@ -122,53 +122,61 @@ class _Run:
             size=self._at if readable else len(message),
             same=same if self._lengths <= _MOST_LENGTHS else None,
             big=self._big,
-            taken=self._taken,
+            places=self._places,
         )
 
-    def _program(self, program: Sequence[Operation], *, taking: bool) -> None:
-        for kind, size, count, slot, counter, body, is_constant in program:
+    def _run_program(self, program: Sequence[Operation], *, wanted: bool) -> None:
+        """Pass over the fields of a program, and store the places of its wanted fields if `wanted`.
+
+        Raises
+        ------
+        _UnreadableError
+            The message ends before its fields, or the program takes too many steps.
+        """
+        for operation, size, count, slot, counter, body, is_constant in program:
             self._steps_left -= 1
             if self._steps_left < 0:
                 raise _UnreadableError
-            number = self._length() if count == COUNTED else count
-            if counter >= 0 and taking:
-                self._taken[counter].append(self._at - 4)
-            if kind == TEXT:
-                if taking and slot >= 0 and len(self._taken[slot]) < MOST_TAKEN:
+            number = self._read_length() if count == COUNTED else count
+            if counter >= 0 and wanted:
+                self._places[counter].append(self._at - 4)
+            if operation == TEXT:
+                if wanted and slot >= 0 and len(self._places[slot]) < MOST_TAKEN:
                     length = number - 1 if self._cdr and number else number
-                    self._taken[slot].append((self._at, min(length, LONGEST_TEXT)))
+                    self._places[slot].append((self._at, min(length, LONGEST_TEXT)))
                 self._at += number
-            elif kind == NUMBERS:
+            elif operation == NUMBERS:
                 if self._cdr and (number or count != COUNTED):
                     self._at += (self._base - self._at) & (size - 1)
                 end = self._at + size * number
                 if end > self._stop:
                     raise _UnreadableError
-                if taking and slot >= 0:
-                    some, taken = number, len(self._taken[slot])
-                    if taken or count == COUNTED:
-                        some = min(number, MOST_ELEMENTS, MOST_TAKEN - taken)
-                    self._taken[slot] += range(self._at, self._at + size * some, size)
+                if wanted and slot >= 0:
+                    stored, before = number, len(self._places[slot])
+                    if before or count == COUNTED:
+                        stored = min(number, MOST_ELEMENTS, MOST_TAKEN - before)
+                    self._places[slot] += range(self._at, self._at + size * stored, size)
                 self._at = end
             else:
-                self._loop(body, number, is_constant=is_constant, taking=taking)
+                self._run_loop(body, number, is_constant=is_constant, wanted=wanted)
 
-    def _loop(self, body: Sequence[Operation], number: int, *, is_constant: bool, taking: bool) -> None:
-        # At least one byte is counted for an element: a loop over elements without fields must end, too.
+    def _run_loop(self, body: Sequence[Operation], number: int, *, is_constant: bool, wanted: bool) -> None:
+        """Pass over `number` elements, each with the fields of `body`; raise as `_run_program`."""
+        # Each element counts as one byte or more, so that a loop over elements without fields ends.
         if number > self._stop - self._at:
             raise _UnreadableError
         before = self._at, self._steps_left
         for i in range(min(number, 2) if is_constant else number):
             before = self._at, self._steps_left
-            self._program(body, taking=taking and i < MOST_ELEMENTS)
+            self._run_program(body, wanted=wanted and i < MOST_ELEMENTS)
         if is_constant and number > 2:
             self._at += (number - 2) * (self._at - before[0])
             self._steps_left += (number - 2) * (self._steps_left - before[1])
             if self._at > self._stop or self._steps_left < 0:
                 raise _UnreadableError
 
-    def _length(self) -> int:
-        """Return the length of a text or a sequence; the message must have at least that number of bytes left."""
+    def _read_length(self) -> int:
+        """Return the length of a text or a sequence; the message must have at least this number of bytes left."""
         if self._cdr:
             self._at += (self._base - self._at) & 3
         if self._at + 4 > self._stop:
@@ -187,32 +195,33 @@ class _Run:
 
 @dataclass(slots=True)
 class Decoder:
-    """Decodes messages of one topic; it knows the shapes of earlier messages.
+    """Decoder of the messages of one topic; it keeps the shapes of earlier messages.
 
     Attributes
     ----------
-    kinds : primitive type by column that the messages have
-    columns : the class that holds decoded messages
+    layout : places of the wanted fields in the messages
+    types : primitive type of each column that the messages have
+    columns : class of the decoded messages
     """
 
     layout: Layout
-    kinds: Mapping[str, str] = field(default_factory=dict)
+    types: Mapping[str, str] = field(default_factory=dict)
     columns: type[Decoded] = field(default_factory=lambda: Decoded)
     _known: list[Shape] = field(default_factory=list)
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> Decoded:
-        """Decode messages [start, end) (n,) of `data`: the first ones, up to the limit of shapes."""
+        """Return the decoded messages [start, end) (n,) of `data`; only the first ones if they have too many shapes."""
         size, undecoded = end - start, np.arange(len(start))
         shapes: list[Shape] = []
         shape_of = np.empty(len(start), np.int64)
         while len(undecoded) and len(shapes) < _SHAPES_AT_ONCE:
             first = undecoded[0]
             message = data[start[first] : end[first]].tobytes()
-            # where few messages are alike, comparison takes longer than decoding
+            # Where few messages have the same shape, a comparison takes longer than decoding.
             compare = len(shapes) < min(_COMPARED_SHAPES, _TRIED_SHAPES + (len(start) - len(undecoded)) // 2)
-            shape = next((one for one in self._known if one.fits(message)), None) if compare else None
+            shape = next((known for known in self._known if known.fits(message)), None) if compare else None
             if shape is None:
-                shape = _Run(self.layout, message).shape
+                shape = _ShapeReader(self.layout, message).shape
                 if len(self._known) < _COMPARED_SHAPES and shape.same is not None:
                     self._known.append(shape)
             fits = np.zeros(len(undecoded), np.bool_)
@@ -220,10 +229,10 @@ class Decoder:
             if compare and shape.same is not None:
                 fits = size[undecoded] >= shape.size if shape.readable else size[undecoded] == shape.size
                 together = values_at_each_byte(data, np.dtype((np.void, shape.size)))[start[undecoded[fits]]]
-                alike = np.ones(len(together), np.bool_)
+                matches = np.ones(len(together), np.bool_)
                 for at, content in shape.same:
-                    alike &= as_first(together, at, len(content))
-                fits[fits] = alike
+                    matches &= as_first(together, at, len(content))
+                fits[fits] = matches
                 if not shapes and shape.readable and shape.size and fits.all():
                     return self.columns(
                         self.layout,
@@ -242,30 +251,33 @@ class Decoder:
 
 
 def as_first(records: NDArray[np.void], at: int, length: int) -> Bools:
-    """Return which records (n,) have the same bytes as the first one, `length` of them from `at` on.
+    """Return for each record (n,) whether its `length` bytes from `at` on equal the bytes of the first record.
 
     Notes
     -----
-    Numbers are compared four times as fast as bytes.
+    The bytes are compared as numbers of up to 8 bytes, which is four times as fast as single bytes.
     """
-    alike, end = np.ones(len(records), np.bool_), at + length
+    equal, end = np.ones(len(records), np.bool_), at + length
     while at < end:
         size = 1 << min((end - at).bit_length() - 1, 3)
         number = records.getfield(f"u{size}", at)
-        alike &= number == number[0]
+        equal &= number == number[0]
         at += size
-    return alike
+    return equal
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Some messages of one topic, with the place of each field in them.
+    """Messages of one topic with the places of the wanted fields in them.
 
     Attributes
     ----------
-    start : (n,) where each readable message begins in `data`
-    shapes, shape_of : the shapes, and the row among them of each readable message (n,)
-    readable : (m,) which of the messages given are readable
+    layout : wanted fields of the messages
+    data : bytes of the messages
+    start : (n,) first byte of each readable message in `data`
+    shapes : the shapes of the messages
+    shape_of : (n,) row in `shapes` of each readable message
+    readable : (m,) whether each message could be decoded
     """
 
     layout: Layout
@@ -276,34 +288,34 @@ class Decoded:
     readable: Bools
 
     def numbers(self, path: str) -> NDArray[Any]:
-        """Return a field of numbers as float64 or int64: (n,) or, of an array, (n, longest).
+        """Return a field of numbers as float64 or int64: (n,), or (n, longest) for an array.
 
         Values that a message lacks are NaN or 0.
         """
         name, number = self.layout.slots[path]
         letter = name[0] if name.startswith(("int", "float")) else "u"
-        kind: np.dtype[Any] = np.dtype(f"<{letter}{SIZES[name]}")
+        dtype: np.dtype[Any] = np.dtype(f"<{letter}{SIZES[name]}")
         result: np.dtype[Any] = np.dtype(np.float64 if letter == "f" else np.int64)
-        offsets: list[list[int]] = [shape.taken[number] if shape.readable else [] for shape in self.shapes]
+        offsets: list[list[int]] = [shape.places[number] if shape.readable else [] for shape in self.shapes]
         width = max(map(len, offsets), default=0) if len(self.start) else 0
         if width == 0:
             return np.empty((len(self.start), 0) if "[*]" in path else 0, result)
         first = offsets[0]
         step = first[1] - first[0] if len(first) > 1 else 0
         if len(offsets) == 1 and (width == 1 or first == [*range(first[0], first[-1] + step, step)]):
-            values = self._fields(first[0], kind, width, step)
+            values = self._fields(first[0], dtype, width, step)
         else:
             table = np.zeros((len(offsets), width), np.int64)
-            for row, one in zip(table, offsets, strict=True):
-                row[: len(one)] = one
-            # a message that lacks the number may be too near to the end of the data to be read there
-            places = np.minimum(self.start[:, None] + table[self.shape_of], len(self.data) - kind.itemsize)
-            values = values_at_each_byte(self.data, kind)[places]
+            for row, row_offsets in zip(table, offsets, strict=True):
+                row[: len(row_offsets)] = row_offsets
+            # A message that lacks the number may end too near to the end of the data to be read there.
+            places = np.minimum(self.start[:, None] + table[self.shape_of], len(self.data) - dtype.itemsize)
+            values = values_at_each_byte(self.data, dtype)[places]
         if any(shape.big for shape in self.shapes):
             big = np.array([shape.big for shape in self.shapes])
             values = np.where(big[self.shape_of, None], values.byteswap(), values)
-        if kind.char == "f":
-            with np.errstate(invalid="ignore"):  # a signalling NaN becomes a NaN
+        if dtype.char == "f":
+            with np.errstate(invalid="ignore"):  # A signalling NaN becomes a quiet NaN.
                 values = values.astype(result, copy=False)
         else:
             values = values.astype(result, copy=False)
@@ -312,43 +324,48 @@ class Decoded:
             values = np.where(lacking, result.type(np.nan if result.kind == "f" else 0), values)
         return values if "[*]" in path else values[:, 0]
 
-    def _fields(self, offset: int, kind: np.dtype[Any], width: int = 1, step: int = 0) -> NDArray[Any]:
-        """Return a field of `width` values (n, width), each `step` bytes behind the other; of one shape, a view."""
+    def _fields(self, offset: int, dtype: np.dtype[Any], width: int = 1, step: int = 0) -> NDArray[Any]:
+        """Return a view of a field of messages of one shape (n, width): values `step` bytes apart from `offset` on."""
         strides = (self.shapes[0].size, step)
-        return np.ndarray((len(self.start), width), kind, self.data, int(self.start[0]) + offset, strides)
+        return np.ndarray((len(self.start), width), dtype, self.data, int(self.start[0]) + offset, strides)
 
     def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
-        """Return the numbers of a text field's texts (n,) or (n, longest), -1 for none; new texts become known."""
+        """Return the number of each text of a text field (n,) or (n, longest), -1 where a message lacks the text.
+
+        Parameters
+        ----------
+        known : number of each text; texts that are not in it are added
+        """
         slot = self.layout.slots[path]
         if not len(self.start):
             return np.empty((0, 0) if "[*]" in path else 0, np.int64)
-        width = max((len(shape.taken[slot.number]) for shape in self.shapes if shape.readable), default=0)
+        width = max((len(shape.places[slot.number]) for shape in self.shapes if shape.readable), default=0)
         numbers: Ints = np.empty((0, width), np.int64)
         for shape, rows in self.by_shape():
             codes = []
-            for at, length in shape.taken[slot.number]:
-                kind = np.dtype((np.void, length))
+            for at, length in shape.places[slot.number]:
+                dtype = np.dtype((np.void, length))
                 texts = (
-                    self._fields(at, kind)[:, 0]
+                    self._fields(at, dtype)[:, 0]
                     if len(self.shapes) == 1
-                    else values_at_each_byte(self.data, kind)[self.start[rows] + at]
+                    else values_at_each_byte(self.data, dtype)[self.start[rows] + at]
                 )
-                is_one = bool(as_first(texts, 0, length).all())
-                codes.append(text_numbers(texts[: 1 if is_one else None].tolist(), known))
-            if len(self.shapes) == 1 and all(len(one) == 1 for one in codes):
+                are_equal = bool(as_first(texts, 0, length).all())
+                codes.append(text_numbers(texts[: 1 if are_equal else None].tolist(), known))
+            if len(self.shapes) == 1 and all(len(field_codes) == 1 for field_codes in codes):
                 numbers = np.broadcast_to(np.array(codes, np.int64).reshape(1, width), (len(self.start), width))
                 break
             if not len(numbers):
                 numbers = np.full((len(self.start), width), -1, np.int64)
-            for place, one in enumerate(codes):
-                numbers[rows, place] = one
+            for column, field_codes in enumerate(codes):
+                numbers[rows, column] = field_codes
         return numbers if "[*]" in path else numbers[:, 0]
 
     def texts(self, path: str) -> list[bytes]:
-        """Return a text field's text of each message (n,)."""
+        """Return the text of a text field in each message (n,)."""
         number, found = self.layout.slots[path].number, np.full(len(self.start), b"", object)
         for shape, rows in self.by_shape():
-            at, length = shape.taken[number][0]
+            at, length = shape.places[number][0]
             if length:
                 found[rows] = values_at_each_byte(self.data, np.dtype((np.void, length)))[
                     self.start[rows] + at
@@ -356,7 +373,7 @@ class Decoded:
         return list(found)
 
     def by_shape(self) -> Iterator[tuple[Shape, Ints | slice]]:
-        """Yield each shape with the rows that have it."""
+        """Yield each shape with the rows of its messages."""
         if len(self.shapes) == 1:
             yield self.shapes[0], slice(None)
             return
@@ -368,7 +385,13 @@ class Decoded:
 
 
 def text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
-    """Return the numbers of texts; new texts become known, all texts beyond `MOST_TEXTS` under one number."""
+    """Return the number of each text.
+
+    Parameters
+    ----------
+    known : number of each text; texts that are not in it are added, beyond `MOST_TEXTS` all under the number of
+        `FURTHER`
+    """
     if len(known) + len(texts) <= MOST_TEXTS:
         return [known.setdefault(text, len(known)) for text in texts]
     numbers = []
@@ -379,19 +402,23 @@ def text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
 
 
 @lru_cache(maxsize=64)
-def _layout(alike: Channel, wanted: tuple[str, ...]) -> Layout:
-    """Return the layout of channels that are alike: thousands of topics of a log may have one type."""
-    encoding: Literal["cdr", "ros1"] = "cdr" if alike.encoding == "cdr" else "ros1"
-    return compile_layout(ros_definitions(alike), alike.message_type, wanted, encoding)
+def _layout(channel: Channel, wanted: tuple[str, ...]) -> Layout:
+    """Return the layout of all channels with one definition, computed once: thousands of topics may have one type."""
+    encoding: Literal["cdr", "ros1"] = "cdr" if channel.encoding == "cdr" else "ros1"
+    return compile_layout(ros_definitions(channel), channel.message_type, wanted, encoding)
 
 
 def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:
     """Return the decoder of a channel of ROS messages.
 
+    Parameters
+    ----------
+    wanted : paths of the wanted fields, as for `compile_layout`
+
     Raises
     ------
     DefinitionError
-        The layout of the channel's type is not known.
+        The definition of the channel's type is missing, or cannot be read.
     """
     layout = _layout(replace(channel, id=0, topic=LogText(""), count=None), tuple(wanted))
-    return Decoder(layout, {path: kind for path, (kind, _) in layout.slots.items()})
+    return Decoder(layout, {path: primitive for path, (primitive, _) in layout.slots.items()})

@@ -1,8 +1,8 @@
-"""Message definitions, and where the wanted fields of a type are: its definition compiled to a small program.
+"""Message definitions, and their compilation into programs that find the wanted fields of a message.
 
-A definition is taken from the log (text, IDL, schema), else from the bundled vendor types, else from ROS 2 Humble. A
-message has no index: the offset of a field depends on the strings and sequences before it. The program lists which
-bytes to pass over and which fields to take; `icrtool.logs.messages.decoder` runs it over one message of each shape.
+A definition comes from the log (text, IDL, schema), else from the bundled vendor types, else from ROS 2 Humble. A
+message has no index: the offset of a field depends on the strings and sequences before it. The program lists the bytes
+to pass over and the fields to read; `icrtool.logs.messages.decoder` runs it over one message of each shape.
 """
 
 from __future__ import annotations
@@ -23,57 +23,64 @@ NUMBERS, TEXT, LOOP = range(3)
 """Kinds of operations."""
 
 Definitions = Mapping[str, tuple[Any, Any]]
-"""``package/msg/Name`` to (constants, fields), as rosbags parses it."""
+"""Constants and fields of message types by ``package/msg/Name``, as rosbags parses them."""
 
 FieldDetail: TypeAlias = Any
-"""Name and length of a field's type; rosbags nests them by the kind of type."""
+"""Type of a field as rosbags writes it: a primitive type with its length, a name, or the nested type of an array."""
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
-"""Kinds of field types, the numbers of rosbags' Nodetype."""
+"""Kinds of field types, as the numbers of rosbags' ``Nodetype``."""
+
 SIZES = {
     "bool": 1, "byte": 1, "char": 1, "octet": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
     "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
 }  # fmt: skip
+"""Sizes of the primitive types [bytes]."""
+
 LONGEST_UNROLLED = 4096
-"""Longest fixed array whose elements are taken: a covariance has 36."""
+"""Largest number of elements of a fixed array that is read. A covariance has 36."""
 
 DEEPEST = 32
-"""Largest depth of messages within one another. Real definitions reach 6; a definition that refers to itself has no
+"""Largest depth of messages within one another. Real definitions have 6; a definition that refers to itself has no
 end."""
 
 LONGEST_FIXED = 1 << 31
 """Largest number of elements of a fixed array."""
 
 MOST_NUMBERS = 1 << 16
-"""Largest number of numbers that are taken from a message."""
+"""Largest number of numbers that are read from a message."""
+
 MOST_ELEMENTS = 256
-"""Largest number of elements taken from a sequence."""
+"""Largest number of elements that are read from a sequence."""
 
 MOST_TAKEN = 1024
-"""Largest number of elements taken from all sequences in the elements of a sequence together."""
+"""Largest number of elements that are read from all inner sequences of a sequence of sequences together."""
 
 Step = str | int | None
-"""A field's name, an element's place, or None for all elements of a sequence."""
+"""A step of a path: the name of a field, the index of an element, or None for all elements of a sequence."""
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+|\*)\]")
 
 COUNTED = -1
-"""Used in place of a number of elements that the message states before the elements."""
+"""Stands for a number of elements that the message states before the elements."""
 
 
 def ros_definitions(channel: Channel) -> Definitions:
-    """Return the definitions that the type of a channel of ROS messages needs.
+    """Return the definitions of the type of a channel of ROS messages, and of all types in it.
 
     Raises
     ------
     DefinitionError
-        Neither the log nor the bundle knows the type, or the log's text cannot be parsed.
+        The definition is neither in the log nor bundled, or the text in the log cannot be parsed.
     """
     return _known_definitions(channel.message_type, channel.definition, channel.definition_format, channel.encoding)[0]
 
 
 def definition_note(channel: Channel) -> str:
-    """Return in words why the log's own definition of a channel's type is not used; empty where it is, or none is."""
+    """Return the reason why the definition in the log of a channel's type is not used.
+
+    The reason is empty where the definition is used, and where the log has none.
+    """
     described = channel.message_type, channel.definition, channel.definition_format, channel.encoding
     return _known_definitions(*described)[1] if channel.encoding in ("cdr", "ros1") else ""
 
@@ -82,13 +89,7 @@ def definition_note(channel: Channel) -> str:
 def _known_definitions(
     message_type: str, text: str, written: Literal["msg", "idl"], encoding: str
 ) -> tuple[Definitions, str]:
-    """Return the definitions that a type needs, and why the log's own definitions are not used; empty where they are.
-
-    Raises
-    ------
-    DefinitionError
-        As `ros_definitions`.
-    """
+    """Return the results of `ros_definitions` and of `definition_note` for a type; raise as `ros_definitions`."""
     name, known = full_name(message_type), bundled_for(encoding)
     has_text = bool(text.strip("\0\ufeff \t\r\n"))
     if not has_text:
@@ -106,8 +107,7 @@ def _known_definitions(
         problem = f"the definition in the log contains {missing}, which is not defined there and not bundled"
     if types:
         *_, last = types
-        is_begun = last in standard_definitions() and _is_begun(types[last][1], known[last][1])
-        if is_begun:
+        if last in standard_definitions() and _is_truncated(types[last][1], known[last][1]):
             return {**known, **types, last: known[last]}, f"the definition in the log ends within {last}"
         if not problem:
             return {**known, **types}, ""
@@ -117,7 +117,7 @@ def _known_definitions(
 
 
 def _without_last_line(text: str, written: Literal["msg", "idl"], message_type: str) -> Definitions:
-    """Return the types of a definition text before its last line, where the log may end it; empty where unreadable."""
+    """Return the types of a definition text without its last line, which may be cut off; empty where unreadable."""
     before = plain_definition(text[: LONGEST_DEFINITION + 1], message_type).rstrip("\n").rpartition("\n")[0]
     try:
         return parse_definition(before, written, message_type) if written == "msg" and before else {}
@@ -126,33 +126,39 @@ def _without_last_line(text: str, written: Literal["msg", "idl"], message_type: 
 
 
 def _missing(definitions: Definitions, name: str) -> str:
-    """Return a type that another one contains and that is not defined; empty where all are."""
-    to_look_at, looked_at = [name], {name}
-    while to_look_at:
-        name = to_look_at.pop()
+    """Return the name of a type that is needed and not defined; empty where all needed types are defined."""
+    pending, seen = [name], {name}
+    while pending:
+        name = pending.pop()
         if name not in definitions:
             return name
         for _, (node, detail) in definitions[name][1]:
             inner = detail[0] if int(node) > NAME else (node, detail)
-            if int(inner[0]) == NAME and inner[1] not in looked_at:
-                looked_at.add(inner[1])
-                to_look_at.append(inner[1])
+            if int(inner[0]) == NAME and inner[1] not in seen:
+                seen.add(inner[1])
+                pending.append(inner[1])
     return ""
 
 
-def _is_begun(fields: Sequence[Any], whole: Sequence[Any]) -> bool:
-    """Return whether fields are the first ones of a type that has more; the name of the last one may be incomplete."""
+def _is_truncated(fields: Sequence[Any], whole: Sequence[Any]) -> bool:
+    """Return whether fields are the first fields of a type with more fields; the last name may be incomplete."""
     if not fields:
         return bool(whole)
-    *before, (last, kind) = fields
-    if before != list(whole[: len(before)]) or len(before) == len(whole):
-        return last.isupper() and before == list(whole)  # a constant of which the value is missing
-    known, known_kind = whole[len(before)]
-    return last.isupper() or (known_kind == kind and known.startswith(last) and list(fields) != list(whole))
+    *complete, (last, last_type) = fields
+    if complete != list(whole[: len(complete)]) or len(complete) == len(whole):
+        # A last name in capitals is a constant whose value is missing.
+        return last.isupper() and complete == list(whole)
+    name, name_type = whole[len(complete)]
+    return last.isupper() or (name_type == last_type and name.startswith(last) and list(fields) != list(whole))
 
 
-def kind_at(definitions: Definitions, name: str, steps: Sequence[Step]) -> str | None:
-    """Return the primitive type of the field at some steps, None where a message of this type has none there."""
+def primitive_type_at(definitions: Definitions, name: str, steps: Sequence[Step]) -> str | None:
+    """Return the primitive type of the field at the end of some steps; None where a type has no such field.
+
+    Parameters
+    ----------
+    name : ``package/msg/Name`` of the type at which the steps begin
+    """
     node: int = NAME
     detail: FieldDetail = name
     for step in steps:
@@ -170,7 +176,7 @@ def kind_at(definitions: Definitions, name: str, steps: Sequence[Step]) -> str |
 
 @cache
 def bundled_definitions() -> Definitions:
-    """Return the vendor types that come with icrtool (see ``definitions/SOURCES.md``)."""
+    """Return the definitions of vendor types that icrtool bundles (sources: ``definitions/SOURCES.md``)."""
     from rosbags.typesys import get_types_from_msg
 
     types: dict[str, Any] = {}
@@ -184,7 +190,7 @@ def bundled_definitions() -> Definitions:
 
 @cache
 def standard_definitions() -> Definitions:
-    """Return the types that come with ROS 2 Humble."""
+    """Return the definitions of the types that ROS 2 Humble contains."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE).fielddefs
@@ -192,7 +198,7 @@ def standard_definitions() -> Definitions:
 
 @cache
 def bundled_for(encoding: str) -> Definitions:
-    """Return all types that do not need a definition in the log, with the fields of ROS 1 Noetic or ROS 2 Humble."""
+    """Return all definitions that a log need not contain, with the fields of ROS 1 Noetic or of ROS 2 Humble."""
     from rosbags.typesys import Stores, get_typestore
 
     definitions = {**standard_definitions(), **bundled_definitions()}
@@ -203,16 +209,17 @@ def bundled_for(encoding: str) -> Definitions:
 
 
 class Operation(NamedTuple):
-    """A step of a program.
+    """An operation of a program: it reads or passes over numbers, a text, or the elements of a loop.
 
     Attributes
     ----------
     kind : `NUMBERS`, `TEXT` or `LOOP`
-    size, number : bytes of one number; count of numbers or elements, or `COUNTED`
-    slot : number of the slot that takes it, -1 where it is passed over
-    counter : number of the slot that takes a counted number of elements, -1 where it is passed over
-    body : what each element of a loop is made of
-    is_constant : nothing in the loop is counted or taken: from the second element on, all have the same size
+    size : size of one number [bytes]
+    number : number of numbers or of elements, or `COUNTED`
+    slot : number of the slot for the values, -1 where they are passed over
+    counter : number of the slot for a counted number of elements, -1 where it is passed over
+    body : operations for each element of a loop
+    is_constant : the body counts nothing and has no slot, so that all elements but the first have the same size
     """
 
     kind: int
@@ -225,7 +232,7 @@ class Operation(NamedTuple):
 
     @property
     def takes(self) -> bool:
-        """Whether the operation takes any field."""
+        """Whether the operation reads any field into a slot."""
         return self.slot >= 0 or self.counter >= 0 or any(operation.takes for operation in self.body)
 
 
@@ -238,18 +245,19 @@ class Slot(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A compiled message layout.
+    """A program that finds the wanted fields in the messages of one type.
 
     Attributes
     ----------
-    slots : by path
+    slots : wanted fields by path; if a definition has a field twice, the second one
+    slot_count : number of slots of the program
+    cdr : whether the messages are CDR, in which numbers are aligned; otherwise ROS 1
     fields : number of fields of the type, with the types in it
-    taken : number of slots; if a definition has a field twice, the last one counts
     """
 
     program: tuple[Operation, ...]
     slots: dict[str, Slot]
-    taken: int
+    slot_count: int
     cdr: bool
     fields: int = 0
 
@@ -261,7 +269,7 @@ def decoding_steps(path: str) -> tuple[Step, ...]:
 
 
 class _Compiler:
-    """Reads a definition once and writes the program."""
+    """Compiler of one message type: it reads the definition once and writes the program."""
 
     def __init__(self, definitions: Definitions, names: FieldNames, wanted: Sequence[str], *, cdr: bool) -> None:
         self._definitions, self._names = definitions, names
@@ -269,10 +277,10 @@ class _Compiler:
         self.cdr = cdr
         self.program: list[Operation] = []
         self.slots: dict[str, Slot] = {}
-        self.fields = self._depth = self._loops = self.taken = self._numbers_taken = 0
+        self.fields = self._depth = self._loops = self.slot_count = self._wanted_numbers = 0
 
-    def message(self, name: str, prefix: str) -> None:
-        """Write the fields of message type `name`."""
+    def add_message(self, name: str, prefix: str) -> None:
+        """Write operations for the fields of message type `name`, whose paths begin with `prefix`."""
         if name not in self._definitions:
             raise DefinitionError(name, "its definition is not in the log and not bundled")
         if self._depth >= DEEPEST:
@@ -285,78 +293,82 @@ class _Compiler:
             path = f"{prefix}{named}"
             self._names.add(path)
             if node == NAME:
-                self.message(detail, f"{path}.")
+                self.add_message(detail, f"{path}.")
             elif node == BASE:
-                self._base(path, detail[0])
+                self._add_field(path, detail[0])
             else:
                 (element, inner), length = detail
                 count = length if node == ARRAY else COUNTED
                 if count > LONGEST_FIXED:
                     raise DefinitionError(path, "its definition has an array longer than a message can be")
                 if element == BASE and inner[0] in SIZES:
-                    self._array(path, inner[0], count)
+                    self._add_array(path, inner[0], count)
                 else:
-                    self._loop(f"{path}[*]", element, inner, count)
+                    self._add_loop(f"{path}[*]", element, inner, count)
         self._depth -= 1
 
-    def _base(self, path: str, kind: str) -> None:
-        if kind == "string":
-            self.program.append(Operation(TEXT, 0, COUNTED, self._slot(path, kind) if path in self._wanted else -1))
-        elif kind not in SIZES:
-            raise DefinitionError(path, f"field type {kind} is not read", "only its message type is affected")
+    def _add_field(self, path: str, primitive: str) -> None:
+        """Write an operation for a single number or text."""
+        if primitive == "string":
+            self.program.append(
+                Operation(TEXT, 0, COUNTED, self._new_slot(path, primitive) if path in self._wanted else -1)
+            )
+        elif primitive not in SIZES:
+            raise DefinitionError(path, f"field type {primitive} is not read", "only its message type is affected")
         elif path in self._wanted:
-            self.program.append(Operation(NUMBERS, SIZES[kind], 1, self._slot(path, kind)))
+            self.program.append(Operation(NUMBERS, SIZES[primitive], 1, self._new_slot(path, primitive)))
         else:
-            self._skip(SIZES[kind], 1)
+            self._add_skip(SIZES[primitive], 1)
 
-    def _slot(self, path: str, kind: str, count: int = 1) -> int:
+    def _new_slot(self, path: str, primitive: str, count: int = 1) -> int:
         """Return the number of a new slot for a field of up to `count` numbers or texts."""
         if path.count("[*]") > 2:
             raise DefinitionError(path, "a sequence in each element of a sequence of sequences is not read")
         nested = path.count("[*]") > 1
-        self._numbers_taken += MOST_TAKEN if nested else count * (MOST_ELEMENTS if self._loops else 1)
-        if self._numbers_taken > MOST_NUMBERS:
-            raise DefinitionError("message", f"more than {MOST_NUMBERS} numbers of each message would be taken")
-        self.slots[path] = Slot(kind, self.taken)
-        self.taken += 1
-        return self.taken - 1
+        self._wanted_numbers += MOST_TAKEN if nested else count * (MOST_ELEMENTS if self._loops else 1)
+        if self._wanted_numbers > MOST_NUMBERS:
+            raise DefinitionError("message", f"more than {MOST_NUMBERS} numbers of each message would be read")
+        self.slots[path] = Slot(primitive, self.slot_count)
+        self.slot_count += 1
+        return self.slot_count - 1
 
-    def _array(self, path: str, kind: str, count: int) -> None:
-        """Write an array (of fixed length) or sequence of numbers."""
-        size, all_of_it = SIZES[kind], f"{path}[*]"
+    def _add_array(self, path: str, primitive: str, count: int) -> None:
+        """Write operations for an array (of fixed length) or a sequence of numbers."""
+        size, every_element = SIZES[primitive], f"{path}[*]"
         is_wanted = any(name.startswith(f"{path}[") for name in self._wanted)
         if count > LONGEST_UNROLLED and is_wanted:
             raise DefinitionError(path, f"an array of {count} numbers is not read")
-        if all_of_it in self._wanted:
-            slot = self._slot(all_of_it, kind, MOST_ELEMENTS if count == COUNTED else count)
-            self.program.append(Operation(NUMBERS, size, count, slot, self._counter(path)))
+        if every_element in self._wanted:
+            slot = self._new_slot(every_element, primitive, MOST_ELEMENTS if count == COUNTED else count)
+            self.program.append(Operation(NUMBERS, size, count, slot, self._new_counter(path)))
         elif count == COUNTED:
             self.program.append(Operation(NUMBERS, size, COUNTED, -1))
         elif is_wanted:
             for i in range(count):
-                self._base(f"{path}[{i}]", kind)
+                self._add_field(f"{path}[{i}]", primitive)
         else:
-            self._skip(size, count)
+            self._add_skip(size, count)
 
-    def _counter(self, path: str) -> int:
-        """Return the slot that takes the number of elements of a sequence, -1 where it is not wanted."""
-        return self._slot(f"{path}[#]", "uint32") if f"{path}[#]" in self._wanted else -1
+    def _new_counter(self, path: str) -> int:
+        """Return the number of a new slot for the number of elements of a sequence, -1 where it is not wanted."""
+        return self._new_slot(f"{path}[#]", "uint32") if f"{path}[#]" in self._wanted else -1
 
-    def _loop(self, path: str, element: int, inner: FieldDetail, count: int) -> None:
+    def _add_loop(self, path: str, element: int, inner: FieldDetail, count: int) -> None:
         """Write a loop over the elements of an array or sequence of strings or messages."""
-        before, self.program, counter = self.program, [], self._counter(path.removesuffix("[*]"))
+        outer, self.program, counter = self.program, [], self._new_counter(path.removesuffix("[*]"))
         self._loops += 1
         if element == BASE:
-            self._base(path, inner[0])
+            self._add_field(path, inner[0])
         else:
-            self.message(inner, f"{path}.")
+            self.add_message(inner, f"{path}.")
         self._loops -= 1
-        body, self.program = tuple(self.program), before
-        is_constant = all(step.number != COUNTED and step.slot < 0 for step in body)
-        is_constant = is_constant and all(step.is_constant for step in body if step.kind == LOOP)
+        body, self.program = tuple(self.program), outer
+        is_constant = all(operation.number != COUNTED and operation.slot < 0 for operation in body)
+        is_constant = is_constant and all(operation.is_constant for operation in body if operation.kind == LOOP)
         self.program.append(Operation(LOOP, 0, count, -1, counter, body, is_constant))
 
-    def _skip(self, size: int, count: int) -> None:
+    def _add_skip(self, size: int, count: int) -> None:
+        """Write an operation that passes over numbers, or extend the last operation by them."""
         if not self.cdr:
             size, count = 1, size * count
         last = self.program[-1] if self.program else None
@@ -372,25 +384,27 @@ def compile_layout(
     wanted: Sequence[str],
     encoding: Literal["cdr", "ros1"],
 ) -> Layout:
-    """Compile the layout of a message type.
+    """Return the layout of the messages of a type.
 
     Parameters
     ----------
     definitions : definitions of the type and of all types in it
     message_type : ``package/Name``
-    wanted : paths such as ``header.stamp.sec``, ``orientation_covariance[0]``, ``position[*]``,
-        ``drivers[*].measured_travel``; paths that the type does not have get no slot. For a sequence in each element of
-        a sequence (``a[*].b[*]``) all elements come in a row; ``a[*].b[#]`` are the lengths of the inner sequences
+    wanted : paths of fields, such as ``header.stamp.sec``, ``orientation_covariance[0]``, ``position[*]`` (all
+        elements) and ``drivers[*].measured_travel``; a path that the type does not have gets no slot. For a sequence in
+        each element of a sequence, ``a[*].b[*]`` are the elements of all inner sequences in one row, and ``a[*].b[#]``
+        the lengths of the inner sequences
+    encoding : serialization of the messages
 
     Raises
     ------
     DefinitionError
-        The definition of a type in it is missing, or a field has a type that cannot be skipped.
+        The definition of a type is missing, a field has a type that cannot be passed over, or a limit is exceeded.
     """
     package, _, name = message_type.partition("/")
     compiler = _Compiler(definitions, FieldNames(message_type), wanted, cdr=encoding == "cdr")
-    compiler.message(f"{package}/msg/{name}", "")
+    compiler.add_message(f"{package}/msg/{name}", "")
     program = compiler.program
     while program and not program[-1].takes:
         program.pop()
-    return Layout(tuple(program), compiler.slots, compiler.taken, compiler.cdr, compiler.fields)
+    return Layout(tuple(program), compiler.slots, compiler.slot_count, compiler.cdr, compiler.fields)

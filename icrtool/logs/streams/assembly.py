@@ -248,9 +248,9 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         The clock was set back, and times repeat: nothing shows which of two samples came first.
     """
     back = [
-        (rows.set_back, role)
+        (rows.backward_step, role)
         for role, rows in streams
-        if rows.set_back.pieces > MOST_PIECES or rows.set_back.step_ns > DISORDER_NS
+        if rows.backward_step.pieces > MOST_PIECES or rows.backward_step.step_ns > DISORDER_NS
     ]
     if back:
         # The largest step among the streams in which times repeat, if there are any: they decide what can be done.

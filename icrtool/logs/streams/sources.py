@@ -15,7 +15,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints
-from icrtool.logs.messages.topic_table import DISORDER_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, STAMPS, SetBack, TopicTable
+from icrtool.logs.messages.topic_table import (
+    DISORDER_NS,
+    NO_BACKWARD_STEP,
+    OUT_OF_ORDER_NS,
+    STAMPS,
+    BackwardStep,
+    TopicTable,
+)
 from icrtool.records.notes import Note
 from icrtool.records.samples import WheelUnit
 
@@ -56,7 +63,7 @@ class StampedRows:
     note : why header stamps are not used, empty where they are
     delay_ns : median of log time minus header stamp, 0 without header stamps
     replaced : number of header stamps of another clock that log times replace
-    set_back : as `TopicTable.set_back`
+    backward_step : as `TopicTable.backward_step`
     clock_set : step of the headers' clock; `header_ns` are corrected for it
     far_ns : (n,) header stamps of a clock far from log time, as simulated time is; None where there are none
     """
@@ -66,7 +73,7 @@ class StampedRows:
     note: str
     delay_ns: int
     replaced: int = 0
-    set_back: SetBack = NOT_SET_BACK
+    backward_step: BackwardStep = NO_BACKWARD_STEP
     clock_set: ClockSet = NEVER_SET
     far_ns: Ints | None = None
 
@@ -80,7 +87,7 @@ def stamp_rows(table: TopicTable) -> StampedRows:
     log_ns = table.log_time_ns
 
     def unusable(note: str, clock_set: ClockSet = NEVER_SET, far_ns: Ints | None = None) -> StampedRows:
-        return StampedRows(None, log_ns, note, 0, set_back=table.set_back, clock_set=clock_set, far_ns=far_ns)
+        return StampedRows(None, log_ns, note, 0, backward_step=table.backward_step, clock_set=clock_set, far_ns=far_ns)
 
     seconds, nanoseconds = (table.integers(*paths) for paths in zip(*STAMPS, strict=True))
     if seconds is None or nanoseconds is None or not len(log_ns):
@@ -109,7 +116,7 @@ def stamp_rows(table: TopicTable) -> StampedRows:
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:
         return unusable(f"{100 * backwards:.0f} % of the header stamps go back", clock_set)
-    return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)), table.set_back, clock_set)
+    return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)), table.backward_step, clock_set)
 
 
 NO_HEADER = "no header"

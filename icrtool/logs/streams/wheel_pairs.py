@@ -374,7 +374,7 @@ def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, In
     rows = stamp_rows(left), stamp_rows(right)
     headers = [one.header_ns for one in rows if one.header_ns is not None and (np.diff(one.header_ns) >= 0).all()]
     clock_set = max(one.clock_set for one in rows)
-    stamps = replace(rows[0], set_back=max(one.set_back for one in rows), clock_set=clock_set)
+    stamps = replace(rows[0], backward_step=max(one.backward_step for one in rows), clock_set=clock_set)
     if len(headers) == 2:
         return stamps, spread_bursts(headers[0]).stamp_ns, spread_bursts(headers[1]).stamp_ns
     why = rows[0].note or rows[1].note or "the header stamps of a side go back"

@@ -42,7 +42,7 @@ def held(values: Floats) -> Floats:
     """Return values (n,) or (n, k) as a column of a log holds them."""
     column = GrowingColumn(0)
     column.add(values, len(values))
-    return np.array(column.taken())
+    return np.array(column.rows())
 
 
 def table_of(message_type: str, fields: tuple[str, ...], rng: np.random.Generator) -> TopicTable:

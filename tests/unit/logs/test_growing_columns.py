@@ -36,7 +36,7 @@ def test_a_column_is_its_parts_joined(seed: int, expected: int) -> None:
     column = GrowingColumn(-1)
     for part in parts:
         column.add(part.copy(), expected)
-    found = column.taken()
+    found = column.rows()
     filled = [part for part in parts if len(part)]
     if filled:
         np.testing.assert_array_equal(found, joined(filled, np.nan if floats else -1))
@@ -49,12 +49,12 @@ def test_equal_rows_take_the_memory_of_one() -> None:
     column = GrowingColumn(0)
     for _ in range(3):
         column.add(np.full((1000, 9), np.nan), 3000)
-    assert column.taken().shape == (3000, 9)
-    assert column.taken().strides[0] == 0
+    assert column.rows().shape == (3000, 9)
+    assert column.rows().strides[0] == 0
 
 
 def test_zero_and_minus_zero_are_kept_apart() -> None:
     column = GrowingColumn(0)
     column.add(np.zeros(5), 10)
     column.add(-np.zeros(5), 10)
-    assert np.signbit(column.taken()).tolist() == [False] * 5 + [True] * 5
+    assert np.signbit(column.rows()).tolist() == [False] * 5 + [True] * 5

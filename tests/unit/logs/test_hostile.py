@@ -575,9 +575,9 @@ def test_a_clock_of_dynamic_joint_states_that_is_set_back_is_seen_within_and_bet
     messages = [(int(stamp), dynamic_joints(int(stamp), WHEELS, ["velocity"])) for stamp in stamps]
     for blocks in ([messages], [messages[:4], messages[4:]], [messages[:2], messages[2:6], messages[6:]]):
         table = columns_of(DYNAMIC, DYNAMIC_JOINTS, (), *blocks)
-        assert table.set_back.step_ns == 3603 * 10**9
+        assert table.backward_step.step_ns == 3603 * 10**9
         assert (np.diff(table.log_time_ns) > 0).all()
-    assert columns_of(DYNAMIC, DYNAMIC_JOINTS, (), messages[:4]).set_back.step_ns == 0
+    assert columns_of(DYNAMIC, DYNAMIC_JOINTS, (), messages[:4]).backward_step.step_ns == 0
 
 
 def test_another_number_of_joints_in_each_message_costs_no_time() -> None:

@@ -494,7 +494,7 @@ def test_odometry_of_an_inertial_system_ranks_above_that_of_wheels() -> None:
     [("sensor_msgs/NavSatFix", "latitude"), ("ublox_msgs/NavPVT", "lat"), ("nav_msgs/Odometry", "pose")],
 )
 def test_a_position_without_a_field_it_needs_is_refused_by_the_field_s_name(name: str, lacking: str) -> None:
-    with pytest.raises(DefinitionError, match=f"no numbers {lacking}"):
+    with pytest.raises(DefinitionError, match=f"no numeric field {lacking}"):
         position(name, other=[1.0, 2.0])
 
 

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from icrtool.config import Config, load_config
-from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC, _degrees, parse_sentence
+from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC, _parse_degrees, parse_sentence
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import read_log
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
@@ -165,8 +165,8 @@ def test_sentences_of_megabytes_cost_no_time() -> None:
 
 @pytest.mark.parametrize("north", ["4760.0001", "4799.0", "-4712.0"])
 def test_more_than_sixty_minutes_or_a_minus_is_no_latitude(north: str) -> None:
-    assert math.isnan(_degrees(north, "N", "NS"))
-    assert _degrees("4730.0", "S", "NS") == -47.5
+    assert math.isnan(_parse_degrees(north, "N", "NS"))
+    assert _parse_degrees("4730.0", "S", "NS") == -47.5
 
 
 def novatel_crc(text: bytes) -> int:

@@ -7,7 +7,7 @@ import pytest
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.messages.topic_table import TopicTable, set_back_of
+from icrtool.logs.messages.topic_table import TopicTable, find_backward_step
 from icrtool.logs.streams.assembly import clock_notes
 from icrtool.logs.streams.sources import NEVER_SET, StampedRows, stamp_rows
 from icrtool.records.text import LogText
@@ -16,7 +16,7 @@ TIMES = np.arange(0, 100_000_000_000, 20_000_000)
 
 
 def notes_of(times: Ints) -> list[str]:
-    rows = StampedRows(None, np.sort(times), "no header", 0, set_back=set_back_of(times))
+    rows = StampedRows(None, np.sort(times), "no header", 0, backward_step=find_backward_step(times))
     return list(clock_notes([("wheels", rows), ("gnss", rows)], "drive"))
 
 

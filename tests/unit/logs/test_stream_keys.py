@@ -177,7 +177,7 @@ def test_a_body_twist_in_fields_that_are_named_gives_the_wheels(tmp_path: Path) 
         (KEYS_OF_TWIST[:1], r"topics.twist_speed: one part alone"),
         ((*KEYS_OF_TWIST, "topics.wheels=/joint_states"), r"topics.twist_speed: the wheels are named twice"),
         ((KEYS_OF_TWIST[0], "topics.twist_turn=/none.z"), r"topics.twist_turn: /none is not in"),
-        ((KEYS_OF_TWIST[0], "topics.twist_turn=/base/state.accel.z"), r"has no numbers accel.z"),
+        ((KEYS_OF_TWIST[0], "topics.twist_turn=/base/state.accel.z"), r"has no numeric field accel.z"),
     ],
 )
 def test_a_wrong_field_of_a_body_twist_is_refused_with_its_key(

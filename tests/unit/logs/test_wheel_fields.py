@@ -152,7 +152,7 @@ def test_any_two_numbers_are_wheels_where_they_are_named(tmp_path: Path, names: 
 @pytest.mark.parametrize(
     ("left", "message"),
     [
-        ("/base.prot", r"topics\.wheel_left: /base\.prot .* no numbers prot"),
+        ("/base.prot", r"topics\.wheel_left: /base\.prot .* no numeric field prot"),
         ("/base.list[3]", r"topics\.wheel_left: /base\.list\[3\] .* no such element"),
         (
             "/base",
