@@ -21,7 +21,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError, LogError
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut, counted_ns
+from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut, folded_ns
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED_SUFFIX, log_name
 from icrtool.logs.csv_table import csv_frame
@@ -170,7 +170,7 @@ def collect_tables(
     topics = {channel.id: (channel.topic, channel.message_type) for channel in container.channels}
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
         for whole in blocks:
-            block = cut.of(whole)
+            block = cut.apply(whole)
             numbers = np.sort(block.channel)  # np.unique takes four times as long as sorting
             for number in numbers[np.diff(numbers, prepend=-1) > 0].tolist():
                 if number not in wanted:
@@ -239,7 +239,7 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
         return WHOLE
     first, span = 0, container.span_ns()
     if span is not None and span[0] >= LATEST_NS:  # the container converts such times in the same manner
-        span = counted_ns(span[0]), counted_ns(span[1])
+        span = folded_ns(span[0]), folded_ns(span[1])
     if isinstance(start, float) or isinstance(end, float):
         if span is not None:
             first = span[0]

@@ -1,4 +1,4 @@
-"""What MCAP files and ROS 1 bags share: one file of chunks, each with its first and last log time in an index."""
+"""Base class of MCAP files and ROS 1 bags: a file of chunks, with an index of the log times of each chunk."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ import numpy as np
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.chunk import (
     LARGEST_CHUNK_BYTES,
+    Buffer,
     Chunk,
     DecompressionError,
     Inflation,
-    Packed,
+    PackedChunk,
     Records,
-    Space,
     decompress,
 )
-from icrtool.logs.containers.container import Channel, Container, Cut, MessageBlock, made_ahead, work_ahead
-from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile
+from icrtool.logs.containers.container import Channel, Container, Cut, MessageBlock, make_ahead, work_ahead
+from icrtool.logs.containers.source import NEAR_BYTES, HeldBytes, LocalFile, RemoteFile
 
 CHUNK_THREADS = 2
-"""Number of threads that make blocks of chunks."""
+"""Number of threads that decompress chunks and make blocks of messages."""
 
 BLOCKS_AHEAD = 3
-"""Number of blocks that the threads make while one is used."""
+"""Largest number of blocks that are made before they are used."""
 
 READERS = 8
 """Number of threads that read a distant file."""
@@ -40,89 +40,92 @@ BYTES_AHEAD = 1 << 26
 """Largest number of bytes of a distant file that are read before they are used."""
 
 FIRST_SPAN_BYTES = 1 << 22
-"""Bytes of chunks in the first piece that is read. It is small because the reader waits for it."""
+"""Size of the first piece of a distant file that is read [bytes]. It is small because the reader waits for it."""
 
 SPAN_BYTES = 1 << 24
-"""Bytes of chunks in each further piece that is read."""
+"""Size of each further piece of a distant file that is read [bytes]."""
 
 JOINED_BYTES = 1 << 22
-"""Bytes of wanted records up to which several chunks become one block: each block has a cost of its own."""
+"""Size of wanted records up to which several chunks become one block [bytes]. Fewer blocks take less time."""
 
 SMALL_PART = 0.5
-"""Share of a chunk below which it is decompressed only up to the last wanted message; its checksum is not computed.
+"""Share of wanted records below which a chunk is decompressed only up to the last wanted message, without its checksum.
 
 In a chunk with images a few percent are wanted, and most recorders close a chunk behind the image that filled it.
 """
 
 
 class NotByRangesError(Exception):
-    """A distant file that cannot be read by ranges."""
+    """A distant file cannot be read by ranges."""
 
 
-class Part(NamedTuple):
+class ChunkPart(NamedTuple):
     """The part of a chunk that is read.
 
     Attributes
     ----------
-    messages : where messages begin in the records that are read, by the message index; None without an index
-    ranges : begin and end (2, n) of the wanted records, where only these are read
-    held : its bytes, read ahead of a distant file
-    records : the wanted records, read ahead of a distant file
+    messages : (m,) first bytes of the messages in the records that are read, by the index; None without an index
+    ranges : (2, n) first bytes and ends of the wanted records if only these are read; None: all are read
+    held : bytes of a distant file that were read ahead and contain the chunk; None: not read ahead
+    records : wanted records of a distant file that were read ahead; None: not read ahead
     """
 
     chunk: Chunk
     messages: Ints | None = None
     ranges: Ints | None = None
-    held: Held | None = None
+    held: HeldBytes | None = None
     records: bytes | None = None
 
     @property
     def wanted_bytes(self) -> int:
-        """Bytes of the records that are read."""
+        """Size of the records that are read [bytes]."""
         return max(self.chunk.size, 0) if self.ranges is None else int((self.ranges[1] - self.ranges[0]).sum())
 
 
-class Spaces(NamedTuple):
-    """Memory for a chunk as it is in the file, for its records, and for the records of several chunks."""
+class Buffers(NamedTuple):
+    """Memory for a compressed chunk, for its decompressed records, and for the wanted records of several chunks."""
 
-    packed: Space
-    records: Space
-    joined: Space
+    packed: Buffer
+    records: Buffer
+    joined: Buffer
 
 
-def reused_spaces() -> Iterator[Spaces]:
-    """Yield memory for one block after the other; it is used again when the blocks made ahead have all been made."""
-    return cycle([Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1)])
+def reused_buffers() -> Iterator[Buffers]:
+    """Yield memory for each block; it is reused for the block after the next `BLOCKS_AHEAD` blocks."""
+    return cycle([Buffers(Buffer(), Buffer(), Buffer()) for _ in range(BLOCKS_AHEAD + 1)])
 
 
 class ChunkedFile(Container):
-    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end.
+    """An open file of chunks.
 
     Parameters
     ----------
-    source : where its bytes come from; None: from the file on disk
+    source : file on disk or distant file; None: the file on disk at `path`
 
     Raises
     ------
     NotByRangesError
-        It is distant and has no index: it is better read from disk.
+        The file is distant and has no index. It must be fetched to disk first.
     """
 
     _chunks: Sequence[Chunk] | None = None
-    _learns = False
-    """Whether channels are still learned from records: while a file without an index is opened."""
+    """Chunks by the index; None for a file without an index, which is read from start to end."""
+
+    _is_learning = False
+    """Whether channels are learned from records, as long as a file without an index is being opened."""
 
     _chunk_head = 0
-    """Bytes before the content of a chunk, in which its record begins."""
+    """Number of bytes from the begin of the record of a chunk to its content."""
 
     _unpacks_parts = False
-    """Whether a compressed chunk is decompressed in part: without a checksum to compute, that saves nothing."""
+    """Whether a compressed chunk may be decompressed in part. This saves time only where it has a checksum."""
 
-    _scan: Callable[[Bytes, int, Ints | None], Records]
-    """Finds records: `scan_mcap` or `scan_bag`."""
+    _find_records: Callable[[Bytes, int, Ints | None], Records]
+    """Function that finds records: `scan_mcap` or `scan_bag`."""
 
     _message_index: Callable[[bytes], tuple[Ints, Ints]]
-    """Returns where in its records the messages of a chunk begin (n,), and their channels (n,); none where damaged."""
+    """Function that returns the first bytes of the messages of a chunk in its records (n,), and their channels (n,);
+    both are empty where the index is damaged."""
 
     def __init__(self, path: Path, message_compression: str = "", source: LocalFile | RemoteFile | None = None) -> None:
         super().__init__(path, message_compression)
@@ -136,11 +139,11 @@ class ChunkedFile(Container):
             if self._chunks is None and self._remote is not None:
                 raise NotByRangesError
             if self._chunks is None:
-                # Its records state what its channels are.
-                self._learns = True
+                # Without an index, the records describe the channels.
+                self._is_learning = True
                 for _ in self._read_in_order():
                     pass
-                self._learns = False
+                self._is_learning = False
             self.channels = self._described_channels()
         except BaseException:
             self.close()
@@ -148,7 +151,7 @@ class ChunkedFile(Container):
 
     @abstractmethod
     def _read_index(self) -> Sequence[Chunk] | None:
-        """Return the chunks that the file's index lists, None without an index, or where it does not fit the file.
+        """Return the chunks that the index lists; None without an index, or where the index does not fit the file.
 
         Raises
         ------
@@ -158,79 +161,81 @@ class ChunkedFile(Container):
 
     @abstractmethod
     def _described_channels(self) -> Sequence[Channel]:
-        """Return the channels, as the index or the records describe them."""
+        """Return the channels that the index or the records describe."""
 
     @abstractmethod
-    def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:
-        """Read a chunk from the file.
+    def _read_packed(self, part: ChunkPart, space: Buffer, needed: int = 0) -> PackedChunk:
+        """Return the compressed content of a chunk, read from the file.
 
         Parameters
         ----------
-        space : for the chunk as it is in the file
-        needed : where not 0, this number of bytes of its records is enough, and they are not checked
+        space : memory for the compressed content
+        needed : number of decompressed bytes that are needed, which are then not checked; 0: all
 
         Raises
         ------
         DecompressionError
-            Its header is damaged.
+            The header of the chunk is damaged.
         """
 
     @abstractmethod
     def _read_in_order(self) -> Iterator[MessageBlock]:
-        """Yield the messages by reading the records one after the other, as far as they can be read."""
+        """Yield the messages up to the first record that cannot be read, without an index."""
 
     @abstractmethod
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
-        """Remember a record that is no message, of `others` of the scan of `data`."""
+        """Store a record of `data` that describes a channel; `record` is an item of `Records.others`."""
 
-    def _described(self, chunk: Chunk) -> Chunk:
-        """Return a chunk of the index with what its own record states."""
+    def _with_header(self, chunk: Chunk) -> Chunk:
+        """Return a chunk of the index, completed by the header of its record."""
         return chunk
 
     def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels, in the order of their chunks; the next are made meanwhile."""
+        """Yield the messages of the wanted channels in the order of their chunks; threads make the next blocks."""
         if self._chunks is None:
-            yield from made_ahead(self._read_in_order())
+            yield from make_ahead(self._read_in_order())
             return
-        needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
-        located = (self._located(chunk, wanted) for chunk in needed)
+        needed = (chunk for chunk in self._chunks if cut.needs(chunk.channels, chunk.begin_ns, chunk.end_ns, wanted))
+        located = (self._locate_part(chunk, wanted) for chunk in needed)
         parts = located if self._remote is None else self._read_ahead(self._remote, needed, wanted)
-        groups = zip(_groups(parts), reused_spaces(), strict=False)
-        for (group, spaces), made in work_ahead(lambda one: self._joined(*one), groups, CHUNK_THREADS, BLOCKS_AHEAD):
+        groups = zip(_group_parts(parts), reused_buffers(), strict=False)
+        for (group, spaces), made in work_ahead(
+            lambda item: self._join_parts(*item), groups, CHUNK_THREADS, BLOCKS_AHEAD
+        ):
             self._at = group[-1].chunk.at
             try:
                 block, inflation = made()
             except (DecompressionError, MemoryError):
-                # the sound parts of each chunk, all of them checked
+                # A chunk of the group is damaged: each chunk is read alone, up to its damage.
                 for part in group:
                     yield from self._read_chunk(part, spaces)
             else:
                 self._inflation.left += inflation.left
                 yield self._with_possible_times(block)
 
-    def _read_ahead(self, remote: RemoteFile, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Part]:
-        """Yield parts of a distant file as `_located` does, while the wanted bytes of the next parts are read."""
+    def _read_ahead(self, remote: RemoteFile, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[ChunkPart]:
+        """Yield the parts of the chunks of a distant file; threads read the wanted bytes of the next parts."""
 
-        def located(span: tuple[list[Chunk], int, int]) -> list[Part]:
+        def located(span: tuple[list[Chunk], int, int]) -> list[ChunkPart]:
             group, begin, end = span
             if 0 < end - begin <= 2 * LARGEST_CHUNK_BYTES:
                 remote.hold(begin, end - begin)
-            return [self._located(chunk, wanted) for chunk in group]
+            return [self._locate_part(chunk, wanted) for chunk in group]
 
-        spans = _spans(chunks, wanted)
+        spans = _group_spans(chunks, wanted)
         for _, parts in work_ahead(
             located, spans, READERS, SPANS_AHEAD, lambda span: (span[2] - span[1]) / BYTES_AHEAD
         ):
             yield from parts()
 
-    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Part:
-        """Return what to read of a chunk: its messages by the message index; of a small wanted part also the ranges.
+    def _locate_part(self, chunk: Chunk, wanted: frozenset[int]) -> ChunkPart:
+        """Return the part of a chunk to read: its messages by the index, and ranges if few records are wanted.
 
-        Where the index cannot be right, the part has neither.
+        Without an index, and with a wrong index, the part has neither.
         """
-        chunk = self._described(chunk)
+        chunk = self._with_header(chunk)
         if max(chunk.size, chunk.length, chunk.index_length) > LARGEST_CHUNK_BYTES:
-            return Part(chunk)
+            return ChunkPart(chunk)
         is_partly, by_message = chunk.is_partly(wanted), chunk.is_partly(wanted) and chunk.is_stored
         held, behind = None, chunk.at + chunk.length
         if self._remote is not None:
@@ -242,62 +247,62 @@ class ChunkedFile(Container):
         begins = places[order]
         ends = np.append(begins[1:], chunk.size)
         if not len(begins) or (ends <= begins).any():
-            return Part(chunk, held=held)
+            return ChunkPart(chunk, held=held)
         is_wanted = np.isin(channels, list(wanted))[order] if is_partly else np.ones(len(begins), np.bool_)
         sizes = (ends - begins)[is_wanted]
         in_part = is_partly and (chunk.is_stored or self._unpacks_parts)
         if not (in_part and 0 < sizes.sum() < SMALL_PART * chunk.size):
-            return Part(chunk, begins, held=held)
+            return ChunkPart(chunk, begins, held=held)
         first, last = begins[is_wanted], ends[is_wanted]
         apart = first[1:] != last[:-1]
         ranges = np.stack([first[np.append(True, apart)], last[np.append(apart, True)]])
         records = None
         if by_message and self._remote is not None:
             records = self._remote.gather(behind - chunk.size, ranges)
-        return Part(chunk, np.cumsum(sizes) - sizes, ranges, held, records)
+        return ChunkPart(chunk, np.cumsum(sizes) - sizes, ranges, held, records)
 
-    def _joined(self, group: Sequence[Part], spaces: Spaces) -> tuple[MessageBlock, Inflation]:
-        """Return the messages of some chunks, and what is left of their limit of decompressed bytes.
+    def _join_parts(self, group: Sequence[ChunkPart], spaces: Buffers) -> tuple[MessageBlock, Inflation]:
+        """Return the messages of a group of chunks as one block, and the count of their decompressed bytes.
 
         Raises
         ------
         DecompressionError
-            Something is damaged, or not as the index states.
+            A chunk is damaged, or not as the index states.
         """
         size = sum(part.wanted_bytes for part in group)
         if size > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {size} bytes")
         inflation = Inflation(0)
-        joined = spaces.joined.of(size + 1)
+        joined = spaces.joined.take(size + 1)
         messages: list[Ints] = []
         data, stop = joined[:0], 0
         for part in group:
             begin = stop
             data = joined[: begin + self._unpack(part, spaces, joined[begin:], inflation)]
             hint = None if part.messages is None else part.messages + begin
-            found, _, stop = self._scan(data, begin, hint)
+            found, _, stop = self._find_records(data, begin, hint)
             if stop < len(data):
                 raise DecompressionError
             messages.append(found)
         return MessageBlock(data, *np.concatenate(messages, axis=1)), inflation
 
-    def _unpack(self, part: Part, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
-        """Decompress the wanted records of a chunk, and return how many bytes they have.
+    def _unpack(self, part: ChunkPart, spaces: Buffers, target: Bytes, inflation: Inflation) -> int:
+        """Write the wanted records of a chunk to `target`, and return their size [bytes].
 
-        A compressed part is read from its begin to the last wanted record, an uncompressed part from the first to the
-        last.
+        A compressed chunk is read from its begin to the last wanted record, an uncompressed chunk from the first wanted
+        record to the last.
 
         Raises
         ------
         DecompressionError
-            As `decompress`, or they have more than the index states, or less.
+            The chunk cannot be decompressed, or its size is not the size that the index states.
         """
         chunk, at = part.chunk, 0
         if part.records is not None:
             target[: len(part.records)] = np.frombuffer(part.records, np.uint8)
             return len(part.records)
         if part.ranges is None:
-            packed = self._packed(part, spaces.packed)
+            packed = self._read_packed(part, spaces.packed)
             inflation.count(len(packed.data), packed.size)
             if packed.size >= len(target):
                 raise DecompressionError("larger than the index states")
@@ -312,9 +317,9 @@ class ChunkedFile(Container):
         else:
             # A whole frame is decompressed in one step.
             first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
-            packed = self._packed(part, spaces.packed, needed=needed)
+            packed = self._read_packed(part, spaces.packed, needed=needed)
             inflation.count(len(packed.data), packed.size)
-            data = decompress(packed, spaces.records.of(packed.size + 1))
+            data = decompress(packed, spaces.records.take(packed.size + 1))
         if len(data) < needed - first:
             raise DecompressionError("smaller than the index states")
         for begin, end in (part.ranges - first).T.tolist():
@@ -327,26 +332,27 @@ class ChunkedFile(Container):
         return self._at / max(self._size, 1)
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the file."""
         self._source.close()
         super().close()
 
     def span_ns(self) -> tuple[int, int] | None:
-        """Return first and last log time by the index, None without one."""
+        """Return the first and the last log time by the index [ns]; None without an index."""
         known = [chunk for chunk in self._chunks or () if chunk.begin_ns]
         return (min(chunk.begin_ns for chunk in known), max(chunk.end_ns for chunk in known)) if known else None
 
-    def _content(self, at: int, length: int, space: Space, held: Held | None = None) -> Bytes:
-        """Return bytes of a chunk, as many as there are.
+    def _content(self, at: int, length: int, space: Buffer, held: HeldBytes | None = None) -> Bytes:
+        """Return `length` bytes of the file from `at` on; fewer at its end.
 
         Parameters
         ----------
-        held : where they are, if they were read ahead
+        space : memory for the bytes
+        held : bytes that were read ahead, which may contain the wanted ones
 
         Raises
         ------
         DecompressionError
-            They are more than a chunk may have.
+            `length` is above the limit of a chunk.
         """
         if length > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {length} bytes")
@@ -355,11 +361,11 @@ class ChunkedFile(Container):
             if held is None or not held.has(at, at + length):
                 held = self._source.hold(at, length)
             return np.frombuffer(held.data, np.uint8, length, at - held.at)
-        content = space.of(length)
+        content = space.take(length)
         return content[: self._source.read_into(at, content)]
 
-    def _read_chunk(self, part: Part, spaces: Spaces) -> Generator[MessageBlock, None, bool]:
-        """Yield the messages of a chunk, and return whether there are blocks, which then hold the memory."""
+    def _read_chunk(self, part: ChunkPart, spaces: Buffers) -> Generator[MessageBlock, None, bool]:
+        """Yield the messages of a chunk, and return whether there were any; they then occupy the memory."""
         chunk = part.chunk
         place = chunk.at - self._chunk_head
         if chunk.size < 0:
@@ -367,9 +373,9 @@ class ChunkedFile(Container):
             return False
         self._at = min(chunk.at, self._size)
         try:
-            packed = self._packed(part, spaces.packed)
+            packed = self._read_packed(part, spaces.packed)
             self._inflation.count(len(packed.data), packed.size)
-            data = decompress(packed, spaces.records.of(packed.size + 1))
+            data = decompress(packed, spaces.records.take(packed.size + 1))
         except (DecompressionError, MemoryError) as err:
             if not chunk.is_cut:
                 self.report("log_damaged", f"chunk at byte {place} left out: {err}")
@@ -386,15 +392,15 @@ class ChunkedFile(Container):
         return begin >= 0
 
     def _scanned(self, data: Bytes, begin: int = 0) -> tuple[MessageBlock, int]:
-        """Return the messages among the records from `begin`, and the first byte not consumed."""
-        messages, others, stop = self._scan(data, begin, None)
-        for record in others if self._learns else ():
+        """Return the messages among the records from `begin` on, and the byte behind the last record."""
+        messages, others, stop = self._find_records(data, begin, None)
+        for record in others if self._is_learning else ():
             self._learn(data, record)
         return self._with_possible_times(MessageBlock(data, *messages)), stop
 
 
-def _spans(chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[list[Chunk], int, int]]:
-    """Yield chunks that follow one another and are read whole, and begin and end of what is read in one piece."""
+def _group_spans(chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[list[Chunk], int, int]]:
+    """Yield groups of chunks that one request reads, each with first byte and end of the range of this request."""
     group: list[Chunk] = []
     begin = end = 0
     most = FIRST_SPAN_BYTES
@@ -410,9 +416,9 @@ def _spans(chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[li
         yield group, begin, end
 
 
-def _groups(parts: Iterable[Part]) -> Iterator[list[Part]]:
-    """Yield parts of chunks in groups of up to `JOINED_BYTES` of wanted records, or of one chunk."""
-    group: list[Part] = []
+def _group_parts(parts: Iterable[ChunkPart]) -> Iterator[list[ChunkPart]]:
+    """Yield groups of parts with up to `JOINED_BYTES` of wanted records in each; a larger part is a group alone."""
+    group: list[ChunkPart] = []
     size = 0
     for part in parts:
         size += part.wanted_bytes

@@ -1,4 +1,4 @@
-"""The base class of containers: an open log with its channels, which yields blocks of raw messages."""
+"""Base class of containers: an open log with its channels, which yields blocks of raw messages."""
 
 from __future__ import annotations
 
@@ -26,39 +26,42 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
+"""Largest number of findings of a container, and largest length of the text of a finding [characters]."""
 
 Report = Callable[[str, str], None]
 """Function that is called with the code and the text of a problem."""
 
 LATEST_NS = 1 << 62
-"""Latest log time [ns], in the year 2116. A later time shows that the log is damaged, and differences of such times do
-not fit into 64 bits."""
+"""Latest log time [ns], in the year 2116. A later time shows that the log is damaged, and differences of such times
+do not fit into 64 bits."""
 
 
 Times = TypeVar("Times", int, Ints)
 
 
-def counted_ns(time_ns: Times) -> Times:
-    """Return times before `LATEST_NS` in place of log times after it, with the same order and intervals.
+def folded_ns(time_ns: Times) -> Times:
+    """Return log times modulo `LATEST_NS` [ns], shifted by half of it.
 
-    Damaged clocks give times around 2^63 and 2^64; such times of a log stay together.
+    Times of a damaged clock are near 2^63 or 2^64. The shift keeps the order and the intervals of such times.
     """
     return (time_ns + LATEST_NS // 2) & (LATEST_NS - 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One topic of a log.
+    """A topic of a log, or the messages of one publisher of a topic.
 
     Attributes
     ----------
-    id : the number that blocks refer to
+    id : number of the channel in blocks
+    topic : name of the topic
     message_type : ``package/Name``, without ROS 2's ``/msg/``
-    encoding : ``cdr`` (ROS 2), ``ros1``, ``protobuf``, ``json``, or the name in the log of an unreadable encoding
-    definition : text of the message definition, empty if the log has none; for Protobuf a character for each byte of
+    encoding : serialization of the messages: ``cdr`` (ROS 2), ``ros1``, ``protobuf``, ``json``, or another name, whose
+        messages are not read
+    definition : text of the message definition, empty if the log has none; for Protobuf one character for each byte of
         the FileDescriptorSet
-    definition_format : format of a definition of ROS
-    count : number of messages by the log's index, None without an index
+    definition_format : language of a ROS definition
+    count : number of messages by the index, None without an index
     """
 
     id: int
@@ -71,14 +74,14 @@ class Channel:
 
 
 class MessageBlock(NamedTuple):
-    """Messages that share one buffer. Valid until the next block is asked for.
+    """Messages in one buffer. A block is valid until the next block is requested.
 
     Attributes
     ----------
-    data : uint8 (bytes,)
-    channel : int64 (n,) channel ids
-    log_time_ns : int64 (n,)
-    start, end : int64 (n,) half-open byte ranges in `data`
+    data : (b,) uint8, the buffer
+    channel : (n,) int64, the id of the channel of each message
+    log_time_ns : (n,) int64, times at which the recorder received the messages
+    start, end : (n,) int64, half-open range of each message in `data`
     """
 
     data: Bytes
@@ -88,7 +91,7 @@ class MessageBlock(NamedTuple):
     end: Ints
 
     def rows(self, chosen: Bools) -> MessageBlock:
-        """Return the block of the chosen (n,) messages."""
+        """Return a block of the messages that a mask (n,) chooses."""
         if chosen.all():
             return self
         _, *columns = self
@@ -96,27 +99,34 @@ class MessageBlock(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """The part of a log that is read: log times in [begin_ns, end_ns), and all messages of the channels in `whole`."""
+    """The part of a log that is read.
+
+    Attributes
+    ----------
+    begin_ns, end_ns : range [begin_ns, end_ns) of the log times that are read [ns]
+    whole : channels of which all messages are read
+    """
 
     begin_ns: int = 0
     end_ns: int = LATEST_NS
     whole: frozenset[int] = frozenset()
 
-    def needs(self, held: frozenset[int] | None, begin_ns: int, end_ns: int, wanted: frozenset[int]) -> bool:
+    def needs(self, channels: frozenset[int] | None, begin_ns: int, end_ns: int, wanted: frozenset[int]) -> bool:
         """Return whether a chunk has to be read.
 
         Parameters
         ----------
-        held : channels in the chunk, None without an index
-        begin_ns, end_ns : first and last log time in the chunk by the index; 0 and 0 where they are not known
+        channels : channels in the chunk, None without an index
+        begin_ns, end_ns : first and last log time in the chunk by the index [ns]; 0 and 0 where they are not known
+        wanted : channels that are read
         """
-        if held is not None and not held & wanted:
+        if channels is not None and not channels & wanted:
             return False
         known = 0 < begin_ns <= end_ns < LATEST_NS
         outside = known and (end_ns < self.begin_ns or begin_ns >= self.end_ns)
-        return not outside or (bool(self.whole) and (held is None or bool(held & self.whole)))
+        return not outside or (bool(self.whole) and (channels is None or bool(channels & self.whole)))
 
-    def of(self, block: MessageBlock) -> MessageBlock:
+    def apply(self, block: MessageBlock) -> MessageBlock:
         """Return a block without the messages outside the cut."""
         if self == WHOLE:
             return block
@@ -131,19 +141,21 @@ def work_ahead(
     work: Callable[[Item], Result], items: Iterable[Item], threads: int, count: int,
     weight: Callable[[Item], float] = lambda _: 0.0,
 ) -> Generator[tuple[Item, Callable[[], Result]]]:  # fmt: skip
-    """Yield items, each with a function that returns the result of the work on it; threads work on the next items.
+    """Yield each item with a function that returns the result of the work on it; threads work on the next items.
 
     Parameters
     ----------
-    count : largest number of items that threads work on ahead of their use
-    weight : returns the share of an item in the work that may be done ahead
+    work : function that is called with each item, in a thread
+    threads : number of threads
+    count : largest number of items that are worked on before they are yielded
+    weight : returns the weight of an item; items are worked on ahead up to a total weight of 1
     """
     pending: deque[tuple[Item, Future[Result]]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         try:
             for item in items:
                 pending.append((item, pool.submit(work, item)))
-                while len(pending) > count or sum(weight(one) for one, _ in pending) > 1:
+                while len(pending) > count or sum(weight(item_ahead) for item_ahead, _ in pending) > 1:
                     first, made = pending.popleft()
                     yield first, made.result
             while pending:
@@ -154,12 +166,12 @@ def work_ahead(
                 made.cancel()
 
 
-def made_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None = None) -> Generator[MessageBlock]:
-    """Yield blocks; a thread makes the next block while a block is used.
+def make_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None = None) -> Generator[MessageBlock]:
+    """Yield blocks; a thread makes the next block while the caller uses a block.
 
     Parameters
     ----------
-    stop : called when no more blocks are wanted, so that the thread ends
+    stop : called when the caller wants no more blocks; it ends the work of the thread
     """
     with ThreadPoolExecutor(1) as pool:
         try:
@@ -168,7 +180,7 @@ def made_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None
                 pending = pool.submit(next, blocks, None)
                 yield block
         except BaseException:
-            # called before the end of the pool, which waits for the next block
+            # The end of the pool waits for the next block, so that the thread is stopped before.
             if stop is not None:
                 stop()
             raise
@@ -177,19 +189,20 @@ def made_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None
 def unpack_messages(
     blocks: Iterator[MessageBlock], wanted: frozenset[int], compression: str, report: Report
 ) -> Iterator[MessageBlock]:
-    """Yield blocks with the wanted messages decompressed, of a bag that was written with message compression.
+    """Yield blocks of decompressed messages, from blocks of a bag in which each message is compressed.
 
     Parameters
     ----------
+    wanted : channels whose messages are decompressed; other messages are left out
     compression : ``zstd``, or the name in metadata.yaml of a compression that is not supported
-    report : called once, after the last block, with how many messages could not be decompressed, and why
+    report : called after the last block if messages could not be decompressed, with their number and the reason
     """
     left_out, reason = 0, ""
     inflation, decompressor = Inflation(), zstandard.ZstdDecompressor()
     for block in blocks:
         kept: list[int] = []
         messages: list[bytes] = []
-        held = 0
+        size_kept = 0
         is_wanted = np.isin(block.channel, list(wanted))
         if not is_wanted.any():
             # The reader updates its progress with each block.
@@ -211,33 +224,33 @@ def unpack_messages(
             else:
                 kept.append(row)
                 messages.append(message)
-                held += len(message)
-            if row == rows[-1] or held > PIECE_BYTES:
+                size_kept += len(message)
+            if row == rows[-1] or size_kept > PIECE_BYTES:
                 end = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
                 data = np.frombuffer(b"".join(messages), np.uint8)
                 yield MessageBlock(data, block.channel[kept], block.log_time_ns[kept], np.append(0, end)[:-1], end)
-                kept, messages, held = [], [], 0
+                kept, messages, size_kept = [], [], 0
     if left_out:
         report("messages_unreadable", f"{left_out} compressed messages left out: {reason}")
 
 
 LARGEST_DESCRIPTIONS_BYTES = 1 << 24
-"""Largest size of the schemas and topics of a log with their definitions [bytes]; 400 topics have 2 MB."""
+"""Largest total size of the schemas, topics and definitions of a log [bytes]. 400 topics have 2 MB."""
 
 
 def ros_type_name(name: str) -> LogText:
-    """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``; a name of one part as it is."""
+    """Return ``package/Name`` for ``package/msg/Name`` and for ``package/Name``; a name of one part unchanged."""
     package, separator, rest = name.partition("/")
     return LogText(f"{package}{separator}{rest.removeprefix('msg/')}")
 
 
 class Origin(NamedTuple):
-    """Origin of a log that was fetched, unpacked, or is read at an address.
+    """Origin of a log that was fetched or unpacked, or that is read at an address.
 
     Attributes
     ----------
-    inputs : files that were read for the log; empty: the files of the log
-    transfer : returns a text about the transfer over a connection; empty without a transfer
+    inputs : files that were read for the log; empty: the files of the container
+    transfer : returns a text about the data that was transferred; empty without a transfer
     remove : removes the temporary files of the log
     """
 
@@ -247,16 +260,16 @@ class Origin(NamedTuple):
 
 
 class Container(ABC):
-    """A log file or directory, opened.
+    """An open log file or directory.
 
     Attributes
     ----------
     path : path of the log in errors
     files : files of the log
-    channels : the topics, known before any block is read
-    mixed : a distant file was read in pieces that also hold other messages than the wanted ones
+    channels : channels of the log, known before any block is read
+    mixed : whether pieces of a distant file were read that also hold messages of other channels than the wanted ones
     message_compression : compression of each single message; empty for none
-    origin : origin of a log that was fetched or unpacked
+    origin : origin of the log
     """
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
@@ -269,7 +282,7 @@ class Container(ABC):
 
     @property
     def problems(self) -> list[Note]:
-        """Findings about data that could not be read and were left out; complete after the last block."""
+        """Findings about data that could not be read; the list is complete after the last block."""
         return [*self._problems]
 
     def report(self, code: str, problem: str) -> None:
@@ -280,20 +293,21 @@ class Container(ABC):
             self._problems.append(note("log_more_problems", "and more of the kind", self._name) if is_last else finding)
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:
-        """Return the files that make up this log, with their SHA-256: of their beginning once `ended` is set."""
+        """Return the files of the log with size and SHA-256; hashing stops once `ended` is set."""
         return self.origin.inputs or tuple(
             InputFile(str(file), file.stat().st_size, file_sha256(file, ended)) for file in self.files
         )
 
     def transfer(self) -> str:
-        """Return the amount of data over a connection as text, and why all was read; empty without a transfer."""
+        """Return a text about the data that was transferred over a connection; empty without a transfer."""
         why = "topics share compressed chunks, which are read whole" if self.mixed else ""
         return "; ".join(filter(None, [self.origin.transfer(), why]))
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[MessageBlock]:
-        """Yield the messages of the channels in `wanted` in file order; other messages may be among them.
+        """Yield the messages of the wanted channels in the order of the file.
 
-        Messages that are outside the cut by the index are not read.
+        The blocks may also hold messages of other channels, and messages outside the cut in a chunk of which a part is
+        inside.
         """
         if wanted:
             blocks = self._stored(wanted, cut)
@@ -303,11 +317,11 @@ class Container(ABC):
 
     @abstractmethod
     def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
-        """Yield the blocks of `blocks` with messages as they are stored, compressed or not."""
+        """Yield the blocks of `blocks` before the decompression of single messages."""
 
     @abstractmethod
     def span_ns(self) -> tuple[int, int] | None:
-        """Return the log times of the first and the last message; None without an index."""
+        """Return the log times of the first and the last message [ns]; None without an index."""
 
     @abstractmethod
     def share_read(self) -> float:
@@ -319,20 +333,20 @@ class Container(ABC):
 
     @cached_property
     def _is_beyond(self) -> bool:
-        """Whether the index shows that all log times are beyond `LATEST_NS`: the clock of the recorder was wrong."""
+        """Whether all log times are beyond `LATEST_NS` by the index: the clock of the recorder was wrong."""
         span = self.span_ns()
         return span is not None and span[0] >= LATEST_NS
 
     def _with_possible_times(self, block: MessageBlock) -> MessageBlock:
         """Return a block without the messages whose log time is negative or beyond `LATEST_NS`.
 
-        Where all log times are beyond it, `counted_ns` keeps their order and intervals.
+        If all log times of the log are beyond it, all messages are kept with their times by `folded_ns`.
         """
         if self._is_beyond:
             why = "log times beyond the year 2116: the clock of the recorder was wrong; only their intervals are used"
             self.report("log_time_impossible", why)
-            return block._replace(log_time_ns=counted_ns(block.log_time_ns))
-        # Negative ones are above all others as unsigned numbers.
+            return block._replace(log_time_ns=folded_ns(block.log_time_ns))
+        # As unsigned numbers, negative times are above all others.
         possible = block.log_time_ns.view(np.uint64) < LATEST_NS
         if possible.all():
             return block

@@ -1,4 +1,4 @@
-"""MCAP files: chunked or not, indexed or not, whole or cut off (https://mcap.dev/spec)."""
+"""MCAP files, with and without chunks, with and without an index, complete or cut off (https://mcap.dev/spec)."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.chunk import (
     LARGEST_CHUNK_BYTES,
     STORED,
+    Buffer,
     Chunk,
     DecompressionError,
-    Packed,
+    PackedChunk,
     Records,
-    Space,
     record_starts,
     values_at_each_byte,
 )
-from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
+from icrtool.logs.containers.chunked_file import ChunkedFile, ChunkPart, reused_buffers
 from icrtool.logs.containers.container import LARGEST_DESCRIPTIONS_BYTES, Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
@@ -51,16 +51,16 @@ _ENCODINGS = {
 }  # fmt: skip
 
 _LARGEST_BLOCK_BYTES = (1 << 17) + 1024
-"""Largest size of a zstd block with the frame's header [bytes]: this number of further compressed bytes gives all bytes
-up to a place."""
+"""Largest size of a zstd block with the header of a frame [bytes]. To decompress n bytes, a decoder needs at most n
+compressed bytes and this number of further ones."""
 
 
 def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
-    """Find the schema, channel and message records from `begin` on.
+    """Return the schema, channel and message records from `begin` on.
 
     Parameters
     ----------
-    hint : (n,) where messages are by the index, ascending; None without one
+    hint : (n,) first bytes of messages by the index, ascending; None without an index
     """
     starts, stop = record_starts(data, begin, hint, _behind_record, _message_ends)
     codes = data[starts]
@@ -78,7 +78,7 @@ def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
 
 
 def _behind_record(data: memoryview, at: int, end: int) -> int:
-    """Return where the record at a place ends, the place where it is cut off or of another kind."""
+    """Return the end of the record at a byte; the byte itself if the record is cut off or of another kind."""
     code, length = _HEAD.unpack_from(data, at) if at + _HEAD_BYTES <= end else (0, 0)
     is_record = _SCHEMA <= code <= _MESSAGE and (code != _MESSAGE or length >= _LEAST_MESSAGE_BYTES)
     behind: int = at + _HEAD_BYTES + length
@@ -86,7 +86,7 @@ def _behind_record(data: memoryview, at: int, end: int) -> int:
 
 
 def _message_ends(data: Bytes, at: Ints) -> Ints:
-    """Return where messages (n,) end; their begin where there is none."""
+    """Return the ends of the messages that begin at some bytes (n,); the byte itself where no message begins."""
     if at[-1] > len(data) - _MESSAGE_HEADS.itemsize:
         return at
     heads = _message_heads(data, at)
@@ -96,13 +96,16 @@ def _message_ends(data: Bytes, at: Ints) -> Ints:
 
 
 def _message_heads(data: Bytes, at: Ints) -> NDArray[Any]:
-    """Return the head of each message (n,)."""
+    """Return the header of each message (n,)."""
     together: NDArray[Any] = values_at_each_byte(data, f"V{_MESSAGE_HEADS.itemsize}")[at].view(_MESSAGE_HEADS)
     return together
 
 
 def _message_index(index: bytes) -> tuple[Ints, Ints]:
-    """Return where in its records the messages of a chunk begin (n,), and their channels (n,); none where damaged."""
+    """Return the first bytes of the messages of a chunk in its records (n,), and their channels (n,).
+
+    Both are empty where the index is damaged.
+    """
     places, channels, at = [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
     while at + _INDEX_HEAD.size <= len(index):
         code, length, channel, _ = _INDEX_HEAD.unpack_from(index, at)
@@ -116,7 +119,7 @@ def _message_index(index: bytes) -> tuple[Ints, Ints]:
 
 
 class McapFile(ChunkedFile):
-    """One MCAP file.
+    """An open MCAP file.
 
     Parameters
     ----------
@@ -125,12 +128,12 @@ class McapFile(ChunkedFile):
     Raises
     ------
     LogError
-        Not an MCAP file.
+        The file is no MCAP file.
     """
 
     _chunk_head = _HEAD_BYTES
     _unpacks_parts = True
-    _scan = staticmethod(scan_mcap)
+    _find_records = staticmethod(scan_mcap)
     _message_index = staticmethod(_message_index)
     _schemas: dict[int, Schema]
     _channels: dict[int, McapChannel]
@@ -142,7 +145,7 @@ class McapFile(ChunkedFile):
 
         @cache
         def text_of(number: int) -> str:
-            """Return the text of a schema, once for all of its channels."""
+            """Return the text of a schema, which is decoded once for all of its channels."""
             schema = self._schemas[number]
             text = ("latin-1",) if schema.encoding == "protobuf" else ("utf-8", "replace")
             return schema.data.decode(*text)
@@ -167,7 +170,7 @@ class McapFile(ChunkedFile):
     def _read_index(self) -> list[Chunk] | None:
         if self._source.read_at(0, len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise LogError(self.path, "not an MCAP file", "its first bytes are not an MCAP file's")
-        # the channels that the index describes; without an index, the records describe them
+        # The channels come from the index, or, without an index, from the records.
         self._schemas, self._channels, self._counts, self._described_bytes = {}, {}, {}, 0
         start, summary = self._summary()
         chunks: list[Chunk] = []
@@ -194,14 +197,14 @@ class McapFile(ChunkedFile):
         if len(schemas) < statistics.schema_count or len(channels) < statistics.channel_count:
             return None
         chunks.sort(key=lambda chunk: chunk.at)
-        if not self._holds_all(chunks, start):
+        if not self._is_complete(chunks, start):
             return None
         self._schemas, self._channels = schemas, channels
         self._counts = dict(statistics.channel_message_counts)
         return chunks
 
     def _summary(self) -> tuple[int, bytes]:
-        """Return the begin of the summary and its records; no records if the summary is damaged."""
+        """Return the offset of the summary and its records; 0 and no records if the summary is damaged."""
         end = self._size - len(MCAP_MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
         footer = self._source.read_at(max(end, 0), _HEAD_BYTES + _FOOTER_BYTES)
         start = int.from_bytes(footer[9:17], "little")
@@ -218,11 +221,11 @@ class McapFile(ChunkedFile):
             return 0, b""
         return start, summary
 
-    def _holds_all(self, chunks: Sequence[Chunk], end: int) -> bool:
-        """Return whether the chunks of the index lie one behind the other, and no message outside them before `end`.
+    def _is_complete(self, chunks: Sequence[Chunk], end: int) -> bool:
+        """Return whether the chunks of the index do not overlap, and hold all messages before `end`.
 
-        A chunk that is not where the index lists it is damage. The index is wrong if the same number of chunks is found
-        without it.
+        A chunk that is not at the offset that the index states is damaged; but if the same number of chunks is found
+        without the index, the index is wrong.
         """
         at, damaged = len(MCAP_MAGIC), []
         ranges = [(chunk.at - _HEAD_BYTES, chunk.at + chunk.length + chunk.index_length) for chunk in chunks]
@@ -238,17 +241,17 @@ class McapFile(ChunkedFile):
                     break
                 at += _HEAD_BYTES + length
             at = behind
-        # To ask a distant file for each head takes minutes; it is fetched where the file or its index may be damaged.
+        # Requests for each header of a distant file take minutes. A file that may be damaged is fetched to disk.
         heads = (self._head(chunk.at - _HEAD_BYTES) for chunk in (chunks[:1] if self._remote is not None else chunks))
         suspect = damaged or any(head != (_CHUNK, chunk.length) for head, chunk in zip(heads, chunks, strict=False))
         if suspect and (self._remote is not None or self._chunks_in_order(end) == len(chunks)):
             return False
-        for one in damaged:
-            self.report("log_damaged", one)
+        for damage in damaged:
+            self.report("log_damaged", damage)
         return True
 
     def _chunks_in_order(self, end: int) -> int:
-        """Return the number of chunks among the records up to `end`; 0 if the records do not follow one another."""
+        """Return the number of chunks among the records up to `end`; 0 if there are gaps between the records."""
         at, count = len(MCAP_MAGIC), 0
         while at < end:
             opcode, length = self._head(at)
@@ -258,13 +261,13 @@ class McapFile(ChunkedFile):
         return count if at == end else 0
 
     def _head(self, at: int) -> tuple[int, int]:
-        """Return opcode and length of the record at a file offset; opcode 0 without a record."""
+        """Return operation code and length of the record at a file offset; code 0 without a record."""
         head = self._source.read_at(at, _HEAD_BYTES) if 0 <= at < self._size else b""
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
     def _read_in_order(self) -> Iterator[MessageBlock]:
-        """Yield the messages record by record, up to the first place that holds none."""
-        at, spaces = len(MCAP_MAGIC), reused_spaces()
+        """Yield the messages up to the first byte where no record begins."""
+        at, spaces = len(MCAP_MAGIC), reused_buffers()
         memory = next(spaces)
         while True:
             opcode, length = self._head(at)
@@ -273,10 +276,10 @@ class McapFile(ChunkedFile):
                 return
             if opcode == _CHUNK:
                 chunk = Chunk(at + _HEAD_BYTES, min(length, remaining), is_cut=length > remaining)
-                if (yield from self._read_chunk(Part(chunk), memory)):
+                if (yield from self._read_chunk(ChunkPart(chunk), memory)):
                     memory = next(spaces)
             elif opcode in (_SCHEMA, _CHANNEL, _MESSAGE) and length <= remaining:
-                block, length = self._read_loose(at, length)
+                block, length = self._read_outside_chunks(at, length)
                 if block is not None:
                     yield block
             if opcode == 0 or length > remaining:
@@ -284,8 +287,8 @@ class McapFile(ChunkedFile):
             at += _HEAD_BYTES + length
         self.report("log_cut_off", f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
-    def _read_loose(self, at: int, length: int) -> tuple[MessageBlock | None, int]:
-        """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""
+    def _read_outside_chunks(self, at: int, length: int) -> tuple[MessageBlock | None, int]:
+        """Return the messages of records outside chunks, and the number of bytes that were read after the first 9."""
         stop = 0
         if length <= LARGEST_CHUNK_BYTES:
             self._at = at
@@ -296,7 +299,7 @@ class McapFile(ChunkedFile):
         self.report("log_damaged", f"record at byte {at} left out: damaged")
         return None, length
 
-    def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:
+    def _read_packed(self, part: ChunkPart, space: Buffer, needed: int = 0) -> PackedChunk:
         length = min(part.chunk.length, needed + _LARGEST_BLOCK_BYTES) if needed else part.chunk.length
         content = self._content(part.chunk.at, length, space, part.held)
         if len(content) < 40:
@@ -312,11 +315,11 @@ class McapFile(ChunkedFile):
         if compression in STORED:
             size = len(data)
         if part.chunk.is_cut or needed:
-            return Packed(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
-        # a header of zeros belongs to an empty chunk; for another chunk the index may state too large a size
+            return PackedChunk(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
+        # A header of zeros is valid for an empty chunk alone; the index of a damaged chunk may state a size.
         if len(data) < packed or (not checksum and not packed and part.chunk.size > 0):
             raise DecompressionError("its header is damaged")
-        return Packed(data, compression, size, checksum=checksum)
+        return PackedChunk(data, compression, size, checksum=checksum)
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         code, _, start, end = record
@@ -334,9 +337,9 @@ class McapFile(ChunkedFile):
             self._described_bytes += end - start
         known = before.setdefault(described.id, described) == described
         if not known:
-            what = f"{type(described).__name__.lower()} {described.id}"
+            subject = f"{type(described).__name__.lower()} {described.id}"
             self.report(
-                "log_parts_contradict", f"{what} is described twice, differently; the first description was used"
+                "log_parts_contradict", f"{subject} has two different descriptions; the first description was used"
             )
 
 

@@ -1,4 +1,4 @@
-"""Open a log: the container is recognised by its content, not by its file name; several files are read as one log."""
+"""Opening of logs: the content of a file, not its name, decides the container; several files may be one log."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
 from icrtool.records.samples import InputFile
 
 MOST_CHANNELS = 1024
-"""Largest number of channels that are read: topics, and for a ROS 1 bag publishers. Each takes 0.5 to 2 ms."""
+"""Largest number of channels that are read: topics, or publishers in a ROS 1 bag. A channel takes 0.5 to 2 ms."""
 
 MOST_FILES = 5000
-"""Largest number of files of a recording. One of three days with a file for each minute has 4,320; each takes about 1
-ms."""
+"""Largest number of files of a recording. Three days with a file for each minute are 4,320 files; a file takes about
+1 ms."""
 
-# A bag of any version: a version other than 2.0 is refused by name.
+# Bags of every version are recognised, so that `Ros1Bag` can name a version that it does not read.
 _CONTAINERS: dict[bytes, type[McapFile | Ros1Bag | SqliteBag]] = {
     mcap_file.MCAP_MAGIC: McapFile,
     ros1_bag.BAG_MAGIC[:9]: Ros1Bag,
@@ -60,21 +60,21 @@ _NOT_A_LOG = (
 
 
 def open_log(path: Path, share: Callable[[float], None] | None = None) -> Container:
-    """Return the opened container at a path or an address; ``-``: standard input.
+    """Return the open container of the log at a path or an address; ``-`` is standard input.
 
     Parameters
     ----------
-    share : called with the share of a log that was fetched or unpacked
+    share : called with the share of the log that was fetched or unpacked, 0 to 1
 
     Raises
     ------
     LogError
-        The path does not exist, the file is empty, is not a known container, or nothing in it can be read.
+        The path does not exist, the file is empty or no log, or nothing in it can be read.
     """
     try:
         remote, why_fetched = RemoteFile(path) if isinstance(path, UrlPath) else None, ""
         if remote is not None:
-            opened = _by_ranges(path, remote)
+            opened = _open_by_ranges(path, remote)
             if not isinstance(opened, str):
                 return opened
             why_fetched = opened
@@ -83,14 +83,14 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
         with ExitStack() as undo:
             scratch = ScratchFolder()
             undo.callback(scratch.close)
-            log, origin, distant = _brought(path, scratch.path, remote, why_fetched, share)
+            log, origin, distant = _bring_to_disk(path, scratch.path, remote, why_fetched, share)
             problem = None
             try:
                 if _is_packed_file(log):
                     log, problem = unpack(log, scratch.path / "unpacked", share)
                 container = _plain_log(log, distant)
             except LogError as err:
-                # The path of the temporary file is gone when the user reads this.
+                # The temporary file no longer exists when the user reads the message, which names the log instead.
                 raise LogError(
                     path, err.why, "; ".join(filter(None, [problem.text if problem is not None else "", err.advice]))
                 ) from err
@@ -107,10 +107,11 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
 
 
 FileState = tuple[int, int, int]
+"""Inode, size [bytes] and time of modification [ns] of a file."""
 
 
 def states_of(path: Path) -> dict[str, FileState]:
-    """Return by path the state of each file of a log, which changes when the file is written; empty for an address."""
+    """Return the state of each file of a log by its path; empty for an address."""
     states: dict[str, FileState] = {}
     for file in () if isinstance(path, UrlPath) else files_of_log(path):
         with suppress(OSError):
@@ -124,8 +125,8 @@ def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterabl
 
     Parameters
     ----------
-    before : result of `states_of`, before the log was opened
-    inputs : the files as they were read
+    before : result of `states_of` before the log was opened
+    inputs : the files that were read
 
     Raises
     ------
@@ -136,25 +137,27 @@ def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterabl
         changed = changed_since(path, inputs)
     else:
         now = states_of(path)
-        changed = any(now.get(one.path) != before.get(one.path) for one in inputs)
+        changed = any(now.get(file.path) != before.get(file.path) for file in inputs)
     if changed:
-        raise LogChangedError(path, "changed while it was read", "is it being recorded? read it when it is whole")
+        raise LogChangedError(path, "changed while it was read", "if it is being recorded, read it when it is complete")
 
 
 @contextmanager
 def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
-    """Yield a file on disk, fetched from an address and decompressed where needed; and the file that was read for it.
+    """Yield the path of a plain file on disk, and the file that was read for it.
+
+    A file at an address is fetched, and a compressed file is decompressed, to a temporary folder.
 
     Raises
     ------
     LogError
-        It cannot be read, or decompressed to its end.
+        The file cannot be fetched, or cannot be decompressed to its end.
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     with closing(ScratchFolder()) as scratch:
         remote = RemoteFile(path) if isinstance(path, UrlPath) else None
-        file, origin, _ = _brought(path, scratch.path, remote)
+        file, origin, _ = _bring_to_disk(path, scratch.path, remote)
         if _is_packed_file(file):
             file, problem = unpack(file, scratch.path / "unpacked")
             if problem is not None:
@@ -162,15 +165,15 @@ def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
         yield file, origin.inputs[0] if origin.inputs else InputFile(str(path), path.stat().st_size, file_sha256(path))
 
 
-def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:
-    """Return the container of a file at an address, where it has an index; else why it has to be fetched."""
+def _open_by_ranges(path: Path, remote: RemoteFile) -> Container | str:
+    """Return the container of a file at an address, or the reason why the file has to be fetched to disk."""
     if remote.is_folder:
         return "SQLite files, or packed"
     if not remote.has_ranges:
         start = remote.start()
         if start and container_of(BytesIO(start)) is None and not is_packed(start):
             raise LogError(path, *_NOT_A_LOG)
-        return "its server gives no parts of a file"
+        return "its server does not send parts of a file"
     start = remote.read_at(0, 512)
     kind = container_of(BytesIO(start))
     if kind is None and is_packed(start):
@@ -184,25 +187,26 @@ def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:
     except NotByRangesError:
         return "it has no index"
     container.origin = Origin((remote.input,), lambda: read_by_ranges([remote]))
-    return _usable(container, path)
+    return _with_limited_channels(container, path)
 
 
-def _brought(
+def _bring_to_disk(
     path: Path,
     folder: Path,
     remote: RemoteFile | None,
     why_fetched: str = "",
     share: Callable[[float], None] | None = None,
 ) -> tuple[Path, Origin, Mapping[str, RemoteFile]]:
-    """Return where a log lies on disk, perhaps packed; a log that is not on disk is fetched or saved to a folder.
+    """Return the path of a log on disk, perhaps packed; a log that is not on disk is fetched or saved to a folder.
 
     Parameters
     ----------
-    remote : what is at an address; None: the log is no address
+    remote : file or folder at the address; None: the log is no address
+    why_fetched : reason why a file is fetched
 
     Returns
     -------
-    log, where it came from, and its files that are read by ranges, as in `BagDirectory`
+    path, origin of the log, and its files that are read by ranges, as in `BagDirectory`
     """
     distant: dict[str, RemoteFile] = {}
     if remote is not None:
@@ -212,7 +216,7 @@ def _brought(
             inputs, distant = fetch_folder(remote.path, log, share)
         else:
             inputs = (remote.fetch(log, share),)
-        size = sum(one.bytes for one in inputs if one.sha256 is not None) / 1e6
+        size = sum(file.bytes for file in inputs if file.sha256 is not None) / 1e6
         fetched = f"{size:.3g} MB fetched to a temporary folder: {why_fetched}" if size else ""
 
         def transfer() -> str:
@@ -237,20 +241,26 @@ def _brought(
 
 
 def _is_packed_file(path: Path) -> bool:
-    """Return whether a path is a file that `unpack` reads."""
+    """Return whether a path is a compressed file or an archive, which `unpack` reads."""
     if not path.is_file():
         return False
     with path.open("rb") as stream:
         return is_packed(stream.read(512))
 
 
-def _usable(container: Container, path: Path) -> Container:
-    """Return a container with the channels that icrtool reads; refuse a container without channels."""
+def _with_limited_channels(container: Container, path: Path) -> Container:
+    """Return a container with at most `MOST_CHANNELS` channels.
+
+    Raises
+    ------
+    LogError
+        The container is damaged and has no channels.
+    """
     if (count := len(container.channels)) > MOST_CHANNELS:
         kept = sorted(container.channels, key=lambda channel: -(channel.count or 0))[:MOST_CHANNELS]
         container.channels = sorted(kept, key=lambda channel: channel.id)
         container.report(
-            "log_limit_reached", f"{count:,} topics and publishers: the {MOST_CHANNELS:,} of most messages are used"
+            "log_limit_reached", f"{count:,} topics and publishers: the {MOST_CHANNELS:,} with most messages are used"
         )
     if container.problems and not container.channels:
         container.close()
@@ -261,7 +271,7 @@ def _usable(container: Container, path: Path) -> Container:
 def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType({})) -> Container:
     """Return the container of a log that is not packed; `distant` as in `BagDirectory`."""
     if (files := split_files(path)) or stat.S_ISDIR(path.stat().st_mode):
-        return _usable(BagDirectory(path, files, distant), path)
+        return _with_limited_channels(BagDirectory(path, files, distant), path)
     if is_special(path):
         # Opening a pipe would block, and every container needs random access.
         raise LogError(path, NOT_REGULAR, SAVE_IT)
@@ -269,29 +279,30 @@ def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType(
         if not stream.read(1):
             raise LogError(path, "an empty file", "the recording never began, or the copy failed")
         if (container := container_of(stream)) is not None:
-            return _usable(container(path), path)
+            return _with_limited_channels(container(path), path)
     raise LogError(path, *_NOT_A_LOG)
 
 
 def container_of(stream: BinaryIO) -> type[McapFile | Ros1Bag | SqliteBag] | None:
-    """Return the type of container by the first bytes of a file; None for a file that is no log."""
+    """Return the class of container that reads a file, by its first bytes; None for a file that is no log."""
     stream.seek(0)
     start = stream.read(max(map(len, _CONTAINERS)))
     return next((container for magic, container in _CONTAINERS.items() if start.startswith(magic)), None)
 
 
 class BagDirectory(Container):
-    """A directory of storage files, or several files of one split recording, read as one log.
+    """A directory of storage files, or the files of a split recording, read as one log.
 
     Parameters
     ----------
-    files : of a recording that is not a directory
-    distant : MCAP files that are empty there, and are read by ranges where they have an index, by their names
+    files : files of a split recording; empty: the storage files of the directory
+    distant : MCAP files at an address by their names, which are empty in the directory; they are read by ranges if they
+        have an index
 
     Raises
     ------
     LogError
-        No storage file in it, none that can be read, or, without metadata.yaml, more than one recording.
+        The directory has no storage file, none that can be read, or, without metadata.yaml, several recordings.
     """
 
     def __init__(
@@ -316,7 +327,7 @@ class BagDirectory(Container):
                     self.report("log_part_unreadable", f"{file.name}: cannot be read; {err.strerror}")
             if not self._parts:
                 raise LogError(
-                    path, "no storage file in it can be read", "; ".join(one.sentence for one in self.problems)
+                    path, "no storage file in it can be read", "; ".join(problem.sentence for problem in self.problems)
                 )
         except BaseException:
             self.close()
@@ -327,7 +338,7 @@ class BagDirectory(Container):
 
     @property
     def problems(self) -> list[Note]:
-        """What could not be read, of the directory and of each file."""
+        """Findings about unreadable data in the directory and in each file."""
         return super().problems + [problem for part in self._parts.values() for problem in part.problems]
 
     def share_read(self) -> float:
@@ -335,7 +346,7 @@ class BagDirectory(Container):
         return (self._reading + [*self._parts.values()][self._reading].share_read()) / len(self._parts)
 
     def close(self) -> None:
-        """Release all files."""
+        """Close all files, and remove the temporary files of the log."""
         for part in self._parts.values():
             part.close()
         if self._scratch is not None:
@@ -343,7 +354,7 @@ class BagDirectory(Container):
         super().close()
 
     def span_ns(self) -> tuple[int, int] | None:
-        """Return first and last log time of all files; None if any file has no index."""
+        """Return the first and the last log time of all files [ns]; None if a file has no index."""
         known = [span for part in self._parts.values() if (span := part.span_ns()) is not None]
         if len(known) < len(self._parts):
             return None
@@ -355,7 +366,7 @@ class BagDirectory(Container):
         Raises
         ------
         LogError
-            At the end: the files, found by name, are recordings of different times.
+            The files were found by their names, and are recordings of different times; raised after the last block.
         """
         spans = []
         parts = zip(self._parts.items(), self._numbers, strict=True)
@@ -363,8 +374,10 @@ class BagDirectory(Container):
             if not len(own):
                 continue
             begins, ends = [], []
-            mine, whole = (frozenset(own[np.isin(merged, list(numbers))].tolist()) for numbers in (wanted, cut.whole))
-            for block in part.blocks(mine, cut._replace(whole=whole)):
+            wanted_here, whole = (
+                frozenset(own[np.isin(merged, list(numbers))].tolist()) for numbers in (wanted, cut.whole)
+            )
+            for block in part.blocks(wanted_here, cut._replace(whole=whole)):
                 if len(block.log_time_ns):
                     begins.append(int(block.log_time_ns.min()))
                     ends.append(int(block.log_time_ns.max()))
@@ -374,11 +387,11 @@ class BagDirectory(Container):
             if begins:
                 spans.append(FileTimes(min(begins), max(ends), file.name))
         if self._by_name:
-            for odd in check_spans(self.path, spans):
-                self.report("log_parts_contradict", odd)
+            for overlap in check_spans(self.path, spans):
+                self.report("log_parts_contradict", overlap)
 
     def _open(self, file: Path, message_compression: str) -> Container:
-        """Return the container of a storage file, decompressed to a temporary folder where it is packed."""
+        """Return the container of a storage file; a compressed file is decompressed to a temporary folder."""
         storage = file
         if unpacked_name(file.name) != file.name:
             self._scratch = self._scratch or ScratchFolder()
@@ -395,7 +408,7 @@ class BagDirectory(Container):
         return (McapFile if storage.suffix == ".mcap" else SqliteBag)(storage, message_compression)
 
     def _merge_channels(self) -> list[Channel]:
-        """Give a topic one number, though it stands in several files."""
+        """Return one channel for each topic of the directory, and store the numbers of the channels of each file."""
         merged: dict[tuple[str, str, str], Channel] = {}
         for part in self._parts.values():
             numbers: dict[int, int] = {}

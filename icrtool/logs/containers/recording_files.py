@@ -1,7 +1,7 @@
-"""The files of a recording: of a bag directory, and of a recorder that split its files or was restarted.
+"""Files of one recording: of a bag directory, and of a recorder that split its files or was restarted.
 
-``drive_{0..3}.bag`` names all files from the first to the last one in the braces, in the order of their numbers or
-dates. It is a path like any other: commands take it, tables show it.
+The path ``drive_{0..3}.bag`` names all files from the first to the last number or date in the braces. Commands accept
+such a path, and tables show it.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from icrtool.records.places import UrlPath, open_regular
 from icrtool.records.text import listed
 
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
-"""Suffixes of recordings. A file with such a suffix counts as a recording; if it cannot be read, that is reported."""
+"""Suffixes of recordings. A file with such a suffix counts as a recording; an error is reported if it is unreadable."""
 
 PACKED_SUFFIX = r"\.(?:zstd|zst|gz|lz4|bz2|xz)"
-"""Suffixes of compressed files."""
+"""Pattern of the suffixes of compressed files."""
 
 _PACKED_END = re.compile(rf"{PACKED_SUFFIX}$", re.IGNORECASE)
 _ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
@@ -30,20 +30,21 @@ _ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
 STORAGE = re.compile(rf"\.(mcap|db3)(?:{PACKED_SUFFIX})?$")
 
 LARGEST_METADATA_BYTES = 1 << 18
-"""Largest size of metadata.yaml [bytes]. The file of a bag of 200 topics has some 100,000 bytes."""
+"""Largest size of metadata.yaml [bytes]. The file of a bag of 200 topics has about 100,000 bytes."""
 
 _DEEPEST = 20
-"""Largest depth of metadata.yaml."""
+"""Largest depth of nested values in metadata.yaml."""
 
 LONGEST_SPLIT_GAP_S = 3600.0
-"""The files of a split recording follow one another without a gap. A longer gap: they are separate recordings."""
+"""Longest time between the files of one recording [s]. A recorder splits a recording without a gap."""
 
 LEAST_OVERLAP_S = 1.0
-"""The files of a split recording overlap by less than this: a recorder fills one buffer while it writes another."""
+"""Overlap of two files from which on it is reported [s]. The files of a split recording overlap by less, because a
+recorder fills one buffer while it writes another."""
 
 
 class FileTimes(NamedTuple):
-    """First and last log time of the messages of a file [ns]."""
+    """First and last log time of the messages of a file [ns], and the name of the file."""
 
     begin_ns: int
     end_ns: int
@@ -56,7 +57,7 @@ def storage_files(directory: Path) -> list[Path]:
     Raises
     ------
     LogError
-        There is none, or there are recordings of several kinds: the user must name one.
+        The directory has no storage file, or holds several recordings, of which the user must name one.
     """
     entries = sorted(directory.iterdir(), key=natural_order)
     storage = [entry for entry in entries if STORAGE.search(entry.name) and entry.is_file()]
@@ -69,7 +70,7 @@ def storage_files(directory: Path) -> list[Path]:
     if len(kinds) == 1 and not others:
         return storage
     if not storage and len(others) == 1:
-        raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} is in it", "name that file")
+        raise LogError(directory, f"not a ROS 2 bag directory; it holds {others[0].name}", f"name {others[0].name}")
     if storage or others:
         why = f"holds more than one recording: {listed([entry.name for entry in (*storage, *others)])}"
         raise LogError(directory, why, "name one of them")
@@ -84,11 +85,13 @@ def storage_files(directory: Path) -> list[Path]:
 
 
 class BagFiles(NamedTuple):
-    """The storage files of a bag directory, and the compression of each message; empty for none.
+    """The storage files of a recording.
 
     Attributes
     ----------
-    by_name : the files were found by their names, because no metadata.yaml lists them
+    files : the storage files in their order
+    message_compression : compression of each single message; empty for none
+    by_name : whether the files were found by their names, because no metadata.yaml lists them
     """
 
     files: list[Path]
@@ -97,16 +100,18 @@ class BagFiles(NamedTuple):
 
 
 def bag_files(directory: Path, report: Callable[[str, str], None]) -> BagFiles:
-    """Return the files that metadata.yaml names and that are there; all storage files where it names none.
+    """Return the existing files that metadata.yaml lists; all storage files of the directory where it lists none.
+
+    A recorder that was killed leaves no metadata.yaml, or an incomplete one.
 
     Parameters
     ----------
-    report : called with code and text of what is missing; a recorder that was killed leaves no such file, or half of it
+    report : called with code and text of each finding about metadata.yaml
 
     Raises
     ------
     LogError
-        As `storage_files`.
+        The directory has no storage file, or holds several recordings.
     """
     file = directory / "metadata.yaml"
     names, message_compression, trouble = list[str](), "", ""
@@ -116,16 +121,16 @@ def bag_files(directory: Path, report: Callable[[str, str], None]) -> BagFiles:
         try:
             if file.stat().st_size > LARGEST_METADATA_BYTES:
                 raise ValueError("too long")
-            names, message_compression = _metadata(file.read_text(encoding="utf-8"))
+            names, message_compression = _parse_metadata(file.read_text(encoding="utf-8"))
         except (ValueError, OSError, RecursionError):
             trouble = "its metadata.yaml cannot be read"
     if trouble:
         report("log_part_unreadable", f"{trouble}; its storage files were found by their names")
     there, missing = dict[Path, None](), dict[str, None]()
-    for name in (Path(one).name for one in names):
-        # a file may have been unpacked since
+    for name in (Path(name).name for name in names):
+        # The file may have been decompressed after the recording.
         stored = [directory / name, directory / unpacked_name(name)]
-        existing = next((one for one in stored if os.path.isfile(one)), None)  # noqa: PTH113 - also of a name that is too long
+        existing = next((file for file in stored if os.path.isfile(file)), None)  # noqa: PTH113 - also of a name that is too long
         if existing is not None:
             there[existing] = None
         else:
@@ -137,13 +142,13 @@ def bag_files(directory: Path, report: Callable[[str, str], None]) -> BagFiles:
     return BagFiles(storage_files(directory), message_compression, by_name=True)
 
 
-def _metadata(text: str) -> tuple[list[str], str]:
-    """Return what the text of a metadata.yaml states: the names of storage files, and how each message is compressed.
+def _parse_metadata(text: str) -> tuple[list[str], str]:
+    """Return the names of the storage files, and the compression of each message, that a metadata.yaml states.
 
     Raises
     ------
     ValueError
-        The text is not YAML, or not the metadata of a bag; or it has an alias.
+        The text is not YAML, has an alias, or is not the metadata of a bag.
     """
     document = _plain_yaml(text)
     information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
@@ -161,8 +166,8 @@ def _plain_yaml(text: str) -> object:
     Raises
     ------
     ValueError
-        The text is not YAML, is nested too deeply, has a key that is no text, or an alias: by aliases a short text
-        stands for gigabytes.
+        The text is not YAML, is nested too deeply, has a key that is no text, or has an alias. With aliases a short
+        text can expand to gigabytes.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -191,14 +196,14 @@ def _plain_yaml(text: str) -> object:
 
 
 def is_bag_directory(folder: Path) -> bool:
-    """Return whether a folder is one ROS 2 recording: it has metadata.yaml, or holds the files of one split alone."""
+    """Return whether a folder is one ROS 2 recording: with metadata.yaml, or with the files of one split recording."""
     if (folder / "metadata.yaml").is_file():
         return any(STORAGE.search(entry.name) for entry in folder.iterdir())
     try:
         files = storage_files(folder)
     except (LogError, OSError):
         return False
-    # The recorder counts its files up: bag_0, bag_1, …
+    # The recorder numbers its files: bag_0, bag_1, …
     stems = [file.name.split(".")[0].rpartition("_") for file in files]
     numbers = [int(number) if stem and number.isdecimal() else -1 for stem, _, number in stems]
     counted = len({stem for stem, _, _ in stems}) == 1 and all(b == a + 1 for a, b in pairwise(numbers))
@@ -206,19 +211,14 @@ def is_bag_directory(folder: Path) -> bool:
 
 
 def check_spans(directory: Path, spans: Sequence[FileTimes]) -> list[str]:
-    """Return the overlaps between the log times of files that were found by name.
-
-    Returns
-    -------
-    list of str
-        A sentence for each pair of files that overlap.
+    """Return a sentence for each pair of successive files whose log times overlap.
 
     Raises
     ------
     LogError
-        They are recordings of different times.
+        More than `LONGEST_SPLIT_GAP_S` lie between two files: they are different recordings.
     """
-    ordered, odd = sorted(spans), []
+    ordered, overlaps = sorted(spans), []
     for number, (before, after) in enumerate(pairwise(ordered)):
         pause_s = (after.begin_ns - max(span.end_ns for span in ordered[: number + 1])) / 1e9
         if pause_s > LONGEST_SPLIT_GAP_S:
@@ -226,28 +226,28 @@ def check_spans(directory: Path, spans: Sequence[FileTimes]) -> list[str]:
             raise LogError(directory, why, f"name one of {listed([span.file for span in ordered])}")
         overlap_s = (min(before.end_ns, after.end_ns) - after.begin_ns) / 1e9
         if overlap_s > LEAST_OVERLAP_S:
-            odd.append(
+            overlaps.append(
                 f"{before.file} and {after.file} overlap by {overlap_s:.0f} s and were read as one recording; "
-                "if they are two, name one of them"
+                "if they are two recordings, name one of them"
             )
-    return odd
+    return overlaps
 
 
 def unpacked_name(name: str) -> str:
-    """Return the name of a file without suffixes of compression and archives: ``a.mcap`` for ``a.mcap.zst``."""
+    """Return the name of a file without the suffixes of compression and archives, ``a.mcap`` for ``a.mcap.zst``."""
     return _ARCHIVE_END.sub("", _PACKED_END.sub("", name))
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts ``drive_10`` after ``drive_9``."""
+    """Return the sorting key of a path, by which ``drive_10`` comes after ``drive_9``."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(path))]
 
 
 _SERIES_NAME = re.compile(r"^(|.*?[_\-. ])((?:19|20)\d\d[\d_.\-T]*|\d+)(\.[A-Za-z]\w*)$")
-"""Groups: the text before a count or a date; the count, or the date (and count); the suffix."""
+"""Pattern of a numbered file; groups: the text before the count or date, the count or date (and count), the suffix."""
 
 STANDARD_INPUT = Path("-")
-"""Stands for the log that is given on standard input."""
+"""Path that stands for a log on standard input."""
 
 _RANGE = re.compile(r"^(.*)\{([\d_.\-T]+?)\.\.([\d_.\-T]+)\}(\.[A-Za-z]\w*)$")
 
@@ -257,9 +257,10 @@ class NumberedFile(NamedTuple):
 
     Attributes
     ----------
-    series : what all files of a series share: their folder, the begin of their names, their suffix
-    number : the count or date as it is written
-    order : its numbers
+    series : folder, begin of the name, and suffix, which all files of a series have in common
+    number : the count or date in the name
+    order : the numbers in the count or date, by which files are sorted
+    path : path of the file
     """
 
     series: tuple[Path, str, str]
@@ -269,12 +270,12 @@ class NumberedFile(NamedTuple):
 
     @property
     def is_count(self) -> bool:
-        """Whether it is a count, which goes up by one."""
+        """Whether the number is a count, which increases by one from file to file."""
         return len(self.order) == 1 and self.number.isdecimal()
 
 
 def numbered_file(path: Path) -> NumberedFile | None:
-    """Return a file's place in a series; None where its name has no count and no date."""
+    """Return a file with its series and number; None if its name has neither a count nor a date."""
     match = _SERIES_NAME.match(path.name)
     if match is None:
         return None
@@ -283,7 +284,13 @@ def numbered_file(path: Path) -> NumberedFile | None:
 
 
 def split_path(files: Sequence[Path]) -> Path:
-    """Return the path that stands for several files of one series, in their order."""
+    """Return the path ``drive_{0..3}.bag`` that stands for sorted files of one series.
+
+    Raises
+    ------
+    ValueError
+        The files are not of one series.
+    """
     first, last = numbered_file(files[0]), numbered_file(files[-1])
     if first is None or last is None or first.series != last.series:
         raise ValueError("files: not of one series")
@@ -292,7 +299,7 @@ def split_path(files: Sequence[Path]) -> Path:
 
 
 def split_files(path: Path) -> list[Path]:
-    """Return the files that a path with a range names, in their order; none where it is another path."""
+    """Return the files that a path with a range in braces names, in their order; empty for any other path."""
     match = _RANGE.match(path.name)
     if match is None or path.exists() or not path.parent.is_dir():
         return []
@@ -300,8 +307,8 @@ def split_files(path: Path) -> list[Path]:
     if first is None or last is None:
         return []
     numbered = filter(None, (numbered_file(file) for file in path.parent.iterdir() if file.name.startswith(match[1])))
-    between = (one for one in numbered if one.series == first.series and first.order <= one.order <= last.order)
-    return [one.path for one in sorted(between, key=lambda one: (one.order, one.number))]
+    between = (file for file in numbered if file.series == first.series and first.order <= file.order <= last.order)
+    return [file.path for file in sorted(between, key=lambda file: (file.order, file.number))]
 
 
 def files_of_log(path: Path) -> list[Path]:
@@ -312,9 +319,9 @@ def files_of_log(path: Path) -> list[Path]:
 
 
 def log_name(path: Path) -> str:
-    """Return a log's name: its (first) file without suffix, or its directory; ``log`` where the name is only dots.
+    """Return the name of a log: its (first) file without suffix, or its directory; ``log`` for a name of dots alone.
 
-    Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
+    The directory of a run has this name. ``..mcap`` must not become the directory of all runs, nor the folder above it.
     """
     if path == STANDARD_INPUT:
         return "stdin"
@@ -330,7 +337,7 @@ def log_name(path: Path) -> str:
 
 
 def file_sha256(file: Path, ended: Event | None = None) -> str:
-    """Return the SHA-256 of a file (hex), of its beginning once `ended` is set."""
+    """Return the SHA-256 of a file (hex); hashing stops once `ended` is set."""
     import hashlib
 
     digest, piece = hashlib.sha256(), bytearray(1 << 18)

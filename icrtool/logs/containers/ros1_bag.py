@@ -1,4 +1,4 @@
-"""ROS 1 bags, version 2.0: indexed or not, whole or cut off (http://wiki.ros.org/Bags/Format/2.0)."""
+"""ROS 1 bags of version 2.0, with and without an index, complete or cut off (http://wiki.ros.org/Bags/Format/2.0)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.chunk import (
     STORED,
+    Buffer,
     Chunk,
     DecompressionError,
-    Packed,
+    PackedChunk,
     Records,
-    Space,
     record_starts,
     values_at_each_byte,
 )
-from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
+from icrtool.logs.containers.chunked_file import ChunkedFile, ChunkPart, reused_buffers
 from icrtool.logs.containers.container import LARGEST_DESCRIPTIONS_BYTES, Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
@@ -33,22 +33,23 @@ _BAG_MESSAGE, _BAG_HEADER, _INDEX_DATA, _BAG_CHUNK, _CHUNK_INFO, _CONNECTION = 2
 
 _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
 _HEADER_BYTES = 1 << 12
-"""Bytes of a chunk that are read to learn its compression, where it may be read in part."""
+"""Number of bytes of a chunk of a distant file that are read to learn its compression."""
 
 _LENGTH = Struct("<I")
 _NONE: Ints = np.empty(0, np.int64)
 _MOST_FIELDS = 100
-"""Largest number of fields of a header outside chunks; real headers have at most ten."""
+"""Largest number of fields of a header outside chunks. Real headers have at most ten."""
 
 _MOST_HEADERS = 1 << 4
-"""Kinds of headers in a chunk that all records are compared with; further ones are read one by one."""
+"""Largest number of different headers in a chunk with which all records are compared; other headers are read one by
+one."""
 
 _VALUE_BYTES = {b"op": 1, b"conn": 4, b"time": 8}
-"""Bytes of the values in the headers of a chunk's records."""
+"""Sizes of the values in the headers of the records of a chunk [bytes]."""
 
 
 class _Record(NamedTuple):
-    """A top-level record: operation code, header fields, file offset of its data, length of its data."""
+    """A record outside chunks: operation code, header fields, offset in the file and length of its data [bytes]."""
 
     op: int
     fields: dict[bytes, bytes]
@@ -56,19 +57,21 @@ class _Record(NamedTuple):
     length: int
 
     def number(self, name: bytes, size: int = 4) -> int:
+        """Return the whole number in a header field, 0 without the field."""
         return int.from_bytes(self.fields.get(name, b"")[:size], "little")
 
     def time(self, name: bytes) -> int:
-        """Return a time [ns], 0 where there is none."""
+        """Return the time in a header field [ns], 0 without the field."""
         nanoseconds, seconds = divmod(self.number(name, 8), 1 << 32)
         return seconds * 1_000_000_000 + nanoseconds
 
     def text(self, name: bytes) -> str:
+        """Return the text in a header field, empty without the field."""
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
 def _fields(header: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yield the fields of a record's or a connection's header: name, and begin and end of the value."""
+    """Yield the fields of a header: name, and first byte and end of the value."""
     end = 0
     while (begin := end + 4) <= len(header):
         end = begin + _LENGTH.unpack_from(header, begin - 4)[0]
@@ -77,11 +80,15 @@ def _fields(header: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _header_fields(header: bytes) -> dict[bytes, bytes]:
+    """Return the values of the fields of a header by their names."""
     return {name: header[begin:end] for name, begin, end in islice(_fields(header), _MOST_FIELDS)}
 
 
 def _message_index(index: bytes) -> tuple[Ints, Ints]:
-    """Return where in its records the messages of a chunk begin (n,), and their connections (n,); none if damaged."""
+    """Return the first bytes of the messages of a chunk in its records (n,), and their connections (n,).
+
+    Both are empty where the index is damaged.
+    """
     places, connections, at = [_NONE], [_NONE], 0
     while at + 8 <= len(index):
         content = at + 8 + int.from_bytes(index[at : at + 4], "little")
@@ -97,13 +104,18 @@ def _message_index(index: bytes) -> tuple[Ints, Ints]:
 
 
 def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
-    """Find the message and connection records of a ROS 1 bag from `begin` on; as `scan_mcap`."""
+    """Return the message and connection records from `begin` on.
+
+    Parameters
+    ----------
+    hint : (n,) first bytes of messages by the index, ascending; None without an index
+    """
     starts, stop = record_starts(data, begin, hint, _behind_record, _record_ends)
     sizes = values_at_each_byte(data, "<u4")[starts] + np.int64(8)
     table = np.empty((5, len(starts)), np.int64)
     unread, rounds = np.arange(len(starts)), 0
     while len(unread):
-        # Most records have headers of the same fields.
+        # The headers of most records have the same fields.
         size = int(sizes[unread[0]])
         fits = sizes[unread] == size if rounds < _MOST_HEADERS else np.arange(len(unread)) == 0
         heads = values_at_each_byte(data, f"V{size}")[starts[unread if fits.all() else unread[fits]]]
@@ -111,9 +123,8 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
         values = [(name, begin + 4) for name, begin, end in _fields(header) if end - begin == _VALUE_BYTES.get(name)]
         fields = {name: at for name, at in values if at + _VALUE_BYTES[name] <= size - 4}
         same, end = np.ones(len(heads), np.bool_), 0
-        # Sorted: in the dict, a name that stands there twice keeps its first position, with the place of its last
-        # value.
-        for name, at in [*sorted(fields.items(), key=lambda one: one[1]), (b"", size - 4)]:
+        # A name that occurs twice has its first position in the dict, but the place of its last value.
+        for name, at in [*sorted(fields.items(), key=lambda field: field[1]), (b"", size - 4)]:
             if at > end:
                 parts = _strided(heads, end, f"V{at - end}")
                 same &= parts == parts[0]
@@ -140,14 +151,17 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
 
 
 def _behind_record(data: memoryview, at: int, end: int) -> int:
-    """Return where the record at a place ends, the place where it is cut off."""
+    """Return the end of the record at a byte; the byte itself if the record is cut off."""
     content = at + 8 + _LENGTH.unpack_from(data, at)[0] if at + 8 <= end else end + 1
     behind: int = content + _LENGTH.unpack_from(data, content - 4)[0] if content <= end else end + 1
     return behind if behind <= end else at
 
 
 def _record_ends(data: Bytes, at: Ints) -> Ints:
-    """Return where records (n,) of a bag end, for headers of the first one's length; else where they begin."""
+    """Return the ends of records that begin at some bytes (n,).
+
+    The byte itself is returned for a record whose header is not as long as the header of the first record.
+    """
     lengths, last = values_at_each_byte(data, "<u4"), len(data) - 4
     size = 8 + int(lengths[at[0]]) if at[-1] <= last else len(data)
     if at[-1] + size > len(data):
@@ -156,20 +170,20 @@ def _record_ends(data: Bytes, at: Ints) -> Ints:
 
 
 def _strided(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
-    """Return the value at an offset in each of some rows of bytes (n,)."""
+    """Return a view of the values (n,) at an offset in rows of bytes."""
     return np.ndarray(len(rows), kind, rows, offset, rows.strides)
 
 
 class Ros1Bag(ChunkedFile):
-    """One ROS 1 bag.
+    """An open ROS 1 bag.
 
     Raises
     ------
     LogError
-        Not a bag of version 2.0, or encrypted.
+        The file is no bag of version 2.0, or is encrypted.
     """
 
-    _scan = staticmethod(scan_bag)
+    _find_records = staticmethod(scan_bag)
     _message_index = staticmethod(_message_index)
 
     _connections: dict[int, Channel]
@@ -191,7 +205,7 @@ class Ros1Bag(ChunkedFile):
             self.report("log_cut_off", "has no index (not closed, or cut off); read from start to end")
         return chunks
 
-    def _described(self, chunk: Chunk) -> Chunk:
+    def _with_header(self, chunk: Chunk) -> Chunk:
         if self._remote is not None and chunk.is_stored:
             self._remote.hold(chunk.at, _HEADER_BYTES)
         record = self._record(chunk.at)
@@ -202,7 +216,7 @@ class Ros1Bag(ChunkedFile):
         return found._replace(channels=chunk.channels, index_length=index_length)
 
     def _record(self, at: int) -> _Record | None:
-        """Return the record at a file offset with its header fields; None where there is no complete header."""
+        """Return the record at a file offset; None without a complete header."""
         if not 0 <= at < self._size:
             return None
         header_length = int.from_bytes(self._source.read_at(at, 4), "little")
@@ -214,7 +228,7 @@ class Ros1Bag(ChunkedFile):
         return _Record(int.from_bytes(fields.get(b"op", b"")[:1], "little"), fields, at + header_length + 8, length)
 
     def _listed_chunks(self) -> list[Chunk] | None:
-        """Return the chunks listed in the bag's index; None where there is none, or it is damaged."""
+        """Return the chunks that the index lists; None without an index, or where it is damaged."""
         first = self._record(len(BAG_MAGIC))
         if first is None or first.op != _BAG_HEADER:
             return None
@@ -233,11 +247,11 @@ class Ros1Bag(ChunkedFile):
             if record.op == _CONNECTION:
                 self._connect(record.fields, content)
             elif record.op == _CHUNK_INFO:
-                held = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
-                for connection, count in held:
+                counts_in_chunk = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
+                for connection, count in counts_in_chunk:
                     counts[connection] = counts.get(connection, 0) + count
                 place = record.number(b"chunk_pos", 8)
-                connections = frozenset(connection for connection, _ in held) or None
+                connections = frozenset(connection for connection, _ in counts_in_chunk) or None
                 chunks[place] = Chunk(place, 0, connections, record.time(b"start_time"), record.time(b"end_time"))
             else:
                 return None
@@ -247,16 +261,16 @@ class Ros1Bag(ChunkedFile):
         self._connections = {n: replace(c, count=counts.get(n, 0)) for n, c in self._connections.items()}
         ordered = sorted(chunks.values(), key=lambda chunk: chunk.at)
         ends = [*(chunk.at for chunk in ordered), first.number(b"index_pos", 8)][1:]
-        # One compression for all chunks, as recorders write; another compression of a chunk is found when it is read.
+        # Recorders write all chunks with one compression. Another compression of a chunk is found when it is read.
         record = self._record(ordered[0].at) if ordered else None
-        kind = record.text(b"compression") if record is not None else "unknown"
+        compression = record.text(b"compression") if record is not None else "unknown"
         return [
-            chunk._replace(index_length=end - chunk.at, compression=kind)
+            chunk._replace(index_length=end - chunk.at, compression=compression)
             for chunk, end in zip(ordered, ends, strict=False)
         ]
 
     def _read_in_order(self) -> Iterator[MessageBlock]:
-        at, spaces = len(BAG_MAGIC), reused_spaces()
+        at, spaces = len(BAG_MAGIC), reused_buffers()
         memory = next(spaces)
         while at < self._size:
             record = self._record(at)
@@ -265,11 +279,11 @@ class Ros1Bag(ChunkedFile):
             is_cut = record.length > self._size - record.at
             if record.op == _BAG_CHUNK:
                 chunk = _chunk_of(record)._replace(is_cut=is_cut)
-                if (yield from self._read_chunk(Part(chunk), memory)):
+                if (yield from self._read_chunk(ChunkPart(chunk), memory)):
                     memory = next(spaces)
             if is_cut:
                 break
-            if self._learns and record.op == _CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
+            if self._is_learning and record.op == _CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
                 content = self._source.read_at(record.at, record.length)
                 self._connect(record.fields, content)
             at = record.at + record.length
@@ -278,20 +292,20 @@ class Ros1Bag(ChunkedFile):
                 "log_cut_off", f"cut off or damaged at byte {at} of {self._size}; everything before it was read"
             )
 
-    def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:  # noqa: ARG002 - all of it
+    def _read_packed(self, part: ChunkPart, space: Buffer, needed: int = 0) -> PackedChunk:  # noqa: ARG002 - all of it
         chunk = part.chunk
         if chunk.size < 0:
             raise DecompressionError("no chunk")
         content = self._content(chunk.at, chunk.length, space, part.held)
         size = len(content) if chunk.compression in STORED else chunk.size
-        return Packed(content, chunk.compression, size, partial=chunk.is_cut)
+        return PackedChunk(content, chunk.compression, size, partial=chunk.is_cut)
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         _, at, start, end = record
         self._connect(_header_fields(bytes(data[at + 4 : start - 4])), bytes(data[start:end]))
 
     def _connect(self, header: dict[bytes, bytes], content: bytes) -> None:
-        """Remember a connection record; `content` is the header that the publisher sent."""
+        """Store the channel of a connection record; `content` is the header that the publisher sent."""
         number = int.from_bytes(header.get(b"conn", b"")[:4], "little")
         fields = {name: value.decode("utf-8", "replace") for name, value in _header_fields(content).items()}
         if number in self._connections or b"type" not in fields:
@@ -310,6 +324,7 @@ class Ros1Bag(ChunkedFile):
 
 
 def _chunk_of(record: _Record) -> Chunk:
+    """Return the chunk that a chunk record describes."""
     compression = record.text(b"compression")
     size = record.length if compression in STORED else record.number(b"size")
     return Chunk(record.at, record.length, size=size, compression=compression)

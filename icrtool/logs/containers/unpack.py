@@ -1,7 +1,7 @@
-"""Compressed logs and archives of them: unpacked below a temporary folder, a piece at a time and with a limit.
+"""Unpacking of compressed logs and archives to a temporary folder, piece by piece and with a limit on the size.
 
-The first bytes of a file state what it is. A log may be compressed (``drive.mcap.zst``), alone in an archive, or a bag
-directory in an archive; what stands in an archive may be compressed again.
+The first bytes of a file show its format. A log may be compressed (``drive.mcap.zst``), or be a file or a bag directory
+in an archive; a file in an archive may be compressed, too.
 """
 
 from __future__ import annotations
@@ -46,14 +46,15 @@ _PIECE_BYTES = 1 << 20
 """Number of bytes that are unpacked at a time."""
 
 _FRAME_PIECE_BYTES = 1 << 16
-"""Number of bytes that a decoder of frames is given at a time. What is behind a frame is copied for the next one."""
+"""Number of bytes that a decoder of frames gets at a time. The bytes behind the end of a frame are copied for the next
+frame."""
 
 _MOST_FRAMES, _LEAST_FRAME_BYTES = 10_000, 100
-"""Number of frames that any file may have, and number of bytes for each further frame. The frames of parallel
-compressors have 64 kB and more."""
+"""Number of frames that every file may have, and size of the file for each further frame [bytes]. The frames of
+parallel compressors have 64 kB and more."""
 
 _DECODER_BYTES = LARGEST_CHUNK_BYTES
-"""Largest number of bytes that a decoder may hold."""
+"""Largest size of the memory of a decoder [bytes]."""
 
 _MOST_ENTRIES = 100_000
 """Largest number of entries of an archive that are read."""
@@ -62,36 +63,39 @@ _MOST_FOLDERS = 100
 """Largest number of folders with logs in an archive. A recording has one folder."""
 
 _LARGEST_EXTRA_BYTES = 1 << 16
-"""Largest long name in a tar archive [bytes]."""
+"""Largest size of a long name in a tar archive [bytes]."""
 
 _LARGEST_READ_BYTES = 1 << 22
-"""Largest piece that zipfile reads at once, such as an archive's directory [bytes]."""
+"""Largest piece that zipfile may read at once, such as the directory of an archive [bytes]."""
 
 _ENCRYPTED = 1
-"""Bit of an entry of a zip archive that states that its content is encrypted."""
+"""Flag of an entry of a zip archive whose content is encrypted."""
 
 _BEHIND = b"icrtool: behind the last frame"
+"""Content of the frame that is put behind the last frame of a zstd file."""
+
 _TAR_BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
 _SPARSE_MORE = 482
-"""Place in the header of a sparse file in a tar archive that states whether a block of places follows it."""
+"""Offset of the byte, in the header of a sparse file of a tar archive, that states whether another block of the header
+follows."""
 
 _TAR = b"ustar"
-"""Mark of a tar archive."""
+"""Characters that mark a tar archive."""
 
 _TAR_MARK = slice(257, 262)
-"""Place of the mark of a tar archive in its first block."""
+"""Range of these characters in the first block of the archive."""
 
 
 class Readable(Protocol):
-    """What is read from start to end."""
+    """A stream of bytes that is read from start to end."""
 
     def read(self, count: int, /) -> bytes:
-        """Return the next bytes, at most `count`; none at the end."""
+        """Return the next bytes, at most `count`; empty at the end."""
         ...
 
 
 class _Frames:
-    """The output of a decoder of the standard library, or of lz4, for frames that follow one another."""
+    """Stream of the decompressed bytes of successive frames, with a decoder of the standard library or of lz4."""
 
     def __init__(self, make: Callable[[], Any], source: Readable) -> None:
         self._make, self._source, self._decoder = make, source, make()
@@ -120,9 +124,9 @@ class _Frames:
 
 
 class _Gzip:
-    """The decoder of a member of a gzip file, with the attributes that the decoders of bz2 and lzma have.
+    """Decoder of a member of a gzip file, with the attributes of the decoders of bz2 and lzma.
 
-    `gzip.GzipFile` reads the name in a header byte by byte.
+    `gzip.GzipFile` is not used because it reads the name in a header byte by byte.
     """
 
     def __init__(self) -> None:
@@ -136,34 +140,34 @@ class _Gzip:
 
     @property
     def unused_data(self) -> bytes:
-        """What stands behind the member, without the zeros that fill up a block."""
+        """The bytes behind the member, without the zeros that fill up a block."""
         return self._decoder.unused_data.lstrip(b"\0")
 
     @property
     def needs_input(self) -> bool:
-        """Whether no further bytes come out without input."""
+        """Whether the decoder returns further bytes only after further input."""
         return not self._is_held
 
     def decompress(self, data: bytes, max_length: int) -> bytes:
-        """Return bytes of the content, at most `max_length`."""
+        """Return decompressed bytes, at most `max_length`."""
         out = self._decoder.decompress(self._decoder.unconsumed_tail + data, max_length)
         self._is_held = bool(self._decoder.unconsumed_tail) or len(out) == max_length
         return out
 
 
 class _Zstd:
-    """The output of zstandard for frames that follow one another.
+    """Stream of the decompressed bytes of successive zstd frames.
 
-    Its reader does not show whether the last frame has ended. A further frame is put behind it: its content comes out
-    only if the last frame has ended.
+    The reader of zstandard does not show whether the last frame is complete. Therefore a further frame is put behind
+    it, whose content is decompressed only if the last frame is complete.
     """
 
     def __init__(self, source: Readable) -> None:
         self._source, self._behind, self._held = source, zstandard.compress(_BEHIND), b""
         decoder = zstandard.ZstdDecompressor(max_window_size=_DECODER_BYTES)
-        self._decoded = decoder.stream_reader(SimpleNamespace(read=self._packed), read_across_frames=True)  # type: ignore[arg-type]  # reads alone are needed
+        self._decoded = decoder.stream_reader(SimpleNamespace(read=self._read_packed), read_across_frames=True)  # type: ignore[arg-type]  # reads alone are needed
 
-    def _packed(self, count: int) -> bytes:
+    def _read_packed(self, count: int) -> bytes:
         if not (piece := self._source.read(count)):
             piece, self._behind = self._behind, b""
         return piece
@@ -192,17 +196,17 @@ _DECODING_ERRORS = (
     OSError, EOFError, RuntimeError, ValueError, NotImplementedError, zlib.error, lzma.LZMAError,
     zipfile.BadZipFile, zstandard.ZstdError,
 )  # fmt: skip
-"""Errors of decoders for data that is damaged or cut off."""
+"""Errors of decoders if the data is damaged or cut off."""
 
 
-def _scratch_of_host() -> str:
-    """Return the first characters of the names of temporary folders on this host."""
+def _scratch_prefix() -> str:
+    """Return the begin of the names of the temporary folders of icrtool on this host."""
     return f"icrtool-{re.sub(r'[^A-Za-z0-9.]', '_', platform.node())[:64]}-"
 
 
-def _clear_dead(folder: Path) -> None:
-    """Remove the temporary folders of this user and host whose process is gone: a killed process removes nothing."""
-    own = _scratch_of_host()
+def _remove_abandoned(folder: Path) -> None:
+    """Remove the temporary folders of this user and host that a killed process left."""
+    own = _scratch_prefix()
     with suppress(OSError):
         for entry in list(os.scandir(folder)):
             number = entry.name.removeprefix(own).partition("-")[0] if entry.name.startswith(own) else ""
@@ -214,7 +218,7 @@ def _clear_dead(folder: Path) -> None:
 
 
 def _is_running(number: int) -> bool:
-    """Return whether there is a process of this number; True where that cannot be known."""
+    """Return whether a process with this number exists; True where this is not known."""
     if os.name == "nt":
         return True
     try:
@@ -227,38 +231,40 @@ def _is_running(number: int) -> bool:
 
 
 class ScratchFolder:
-    """A temporary folder, removed when it is closed, or when the process is ended by force."""
+    """A temporary folder that is removed when it is closed, or when a signal ends the process."""
 
     def __init__(self) -> None:
-        with process_resources.undisturbed():  # Python tries out which folder can be written
+        # Python finds the folder by writing a file, which a signal must not leave behind.
+        with process_resources.undisturbed():
             folder = Path(tempfile.gettempdir())
-        _clear_dead(folder)
-        self.path = folder / f"{_scratch_of_host()}{os.getpid()}-{secrets.token_hex(8)}"
-        # before it is there: a signal may come at any time
+        _remove_abandoned(folder)
+        self.path = folder / f"{_scratch_prefix()}{os.getpid()}-{secrets.token_hex(8)}"
+        # The folder is registered before it is made, because a signal may come at any time.
         process_resources.mark_unfinished(self.path)
         self.path.mkdir(mode=0o700)
         self._remove = weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
 
     def close(self) -> None:
-        """Remove it."""
+        """Remove the folder."""
         self._remove()
         process_resources.mark_finished(self.path)
 
 
 def is_packed(start: bytes) -> bool:
-    """Return whether a file is compressed or an archive, by its first 512 bytes."""
+    """Return whether a file is compressed or an archive, given its first 512 bytes."""
     return start.startswith((_ZIP, *DECODERS)) or start[_TAR_MARK] == _TAR
 
 
 def save_unpacked(
     source: Readable, place: Path, check: Callable[[bytes], None], check_length: Callable[[int], None]
 ) -> str:
-    """Write a stream to a file, and return the SHA-256 of it (hex).
+    """Write a stream to a file, and return its SHA-256 (hex).
 
     Parameters
     ----------
-    check : called with the first 512 bytes, before any more is read; refuses a stream by an error of its own
-    check_length : called with the number of bytes before they are written; refuses a stream that is too long
+    place : path of the file
+    check : called with the first 512 bytes before more is read; it raises an error to refuse the stream
+    check_length : called with the total number of bytes before they are written; it raises an error if it is too large
 
     Raises
     ------
@@ -281,17 +287,21 @@ def save_unpacked(
 
 
 def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = None) -> tuple[Path, Note | None]:
-    """Unpack a file that is compressed, or an archive: return the log, and what went wrong (None: nothing).
+    """Return the path of the log in a compressed file or an archive, after unpacking it, and a finding about damage.
 
     Parameters
     ----------
-    folder : where to; files keep the names that they have in an archive
-    share : called with the share of the file that was unpacked
+    folder : folder for the unpacked files, which keep the names that they have in an archive
+    share : called with the share of the file that was unpacked, 0 to 1
+
+    Returns
+    -------
+    path of the file or bag directory; finding about the first problem, None without a problem
 
     Raises
     ------
     LogError
-        It does not decompress, the disk is full, or it is an archive without a log, or with several.
+        The file cannot be decompressed, the disk is full, or the archive holds no log or several logs.
     """
     folder.mkdir(exist_ok=True)
     try:
@@ -299,7 +309,7 @@ def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = Non
             size = path.stat().st_size
             budget = _Budget(LARGEST_CHUNK_BYTES + LARGEST_RATIO * size)
             watch = (lambda: share(file.tell() / max(size, 1))) if share is not None else None
-            logs = _unpacked(path, file, folder, budget, watch)
+            logs = _unpack_file(path, file, folder, budget, watch)
     except OSError as err:
         free = shutil.disk_usage(folder).free
         raise LogError(path, f"cannot be unpacked: {err.strerror}", f"{free} bytes are free for it") from err
@@ -313,26 +323,32 @@ def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = Non
 
 @dataclass(slots=True)
 class _Budget:
-    """The bytes that a file may still be unpacked to, and the first thing that went wrong."""
+    """Limit on the size of the unpacked files.
+
+    Attributes
+    ----------
+    left : number of bytes that may still be unpacked
+    trouble : finding about the first problem; after it nothing more is unpacked
+    """
 
     left: int
     trouble: Note | None = None
 
     def stop(self, code: str, trouble: object) -> None:
-        """Let nothing more be read."""
+        """Store a problem, so that nothing more is unpacked; only the first problem is kept."""
         self.trouble = self.trouble or note(code, str(trouble))
 
 
 class _Stream:
-    """A stream that also ends where it is damaged, or is longer than its budget allows.
+    """A stream that ends where its source is damaged, or at the limit of its budget.
 
     Parameters
     ----------
-    size : length of the part of `source` that is read, by default all [bytes]
+    size : length of the part of `source` that is read [bytes]; by default all
     """
 
     def __init__(self, source: Readable, budget: _Budget, size: float = math.inf) -> None:
-        # Bytes that a decoder returned are kept where the next bytes are damaged.
+        # `read1` returns the bytes before a damaged part; `read` would lose them.
         self._read: Callable[[int], bytes] = getattr(source, "read1", source.read)
         self._budget, self._left, self._head = budget, size, b""
 
@@ -347,8 +363,9 @@ class _Stream:
         try:
             piece = self._read(count)
         except _DECODING_ERRORS as err:
+            # An error number shows that the disk failed; the data is not the cause.
             if isinstance(err, OSError) and err.errno is not None:
-                raise  # of the disk, not of the data
+                raise
             self._budget.stop("log_cut_off", f"cut off or damaged ({err})")
             return b""
         self._left -= len(piece)
@@ -361,7 +378,7 @@ class _Stream:
         return piece
 
     def exactly(self, count: int) -> bytes:
-        """Return the next `count` bytes, fewer at the end."""
+        """Return the next `count` bytes; fewer at the end."""
         pieces = []
         while count and (piece := self.read(min(count, _PIECE_BYTES))):
             pieces.append(piece)
@@ -374,18 +391,18 @@ class _Stream:
             count -= len(piece)
 
     def start(self) -> bytes:
-        """Return the first 512 bytes, which stay there to be read."""
+        """Return the next 512 bytes without consuming them."""
         self._head = self.exactly(_TAR_BLOCK_BYTES)
         return self._head
 
     def decompressed(self) -> _Stream:
-        """Return the stream that it is when decompressed, itself where it is not compressed."""
+        """Return the stream of the decompressed content; the stream itself if it is not compressed."""
         start = self.start()
         decoder_found = next((decoder for magic, decoder in DECODERS.items() if start.startswith(magic)), None)
         return self if decoder_found is None else _Stream(decoder_found(self), self._budget)
 
     def write_to(self, place: Path, watch: Callable[[], None] | None) -> None:
-        """Write all of it to a file."""
+        """Write the rest of the stream to a file; call `watch` after each piece."""
         with place.open("wb") as sink:
             while piece := self.read(_PIECE_BYTES):
                 sink.write(piece)
@@ -393,10 +410,10 @@ class _Stream:
                     watch()
 
 
-def _unpacked(
+def _unpack_file(
     path: Path, file: BufferedReader, folder: Path, budget: _Budget, watch: Callable[[], None] | None
 ) -> Path:
-    """Unpack an open file, and return the file or bag directory that is the log."""
+    """Unpack an open file, and return the path of the log: a file or a bag directory; raise as `unpack`."""
     packed = _Stream(file, budget)
     if not is_packed(start := packed.start()):
         raise LogError(path, "does not decompress", "its first bytes belong to no known compression")
@@ -432,7 +449,7 @@ def _unpacked(
         raise LogError(path, "no log in it", f"it holds {listed(others) or 'nothing'}")
     if not found:
         return folder
-    # A bag directory is one recording, whatever its name; a file that is there twice is two recordings.
+    # A bag directory is one recording. A file that the archive holds twice is two recordings.
     bags = {group for group in groups.values() if is_bag_directory(group)}
     found = [*bags] + [file for file in found if file.parent not in bags]
     if len(found) > 1:
@@ -445,7 +462,8 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
 
     Notes
     -----
-    `tarfile` keeps all entries, and reads a name of any length: an archive could exhaust the memory with either.
+    `tarfile.TarFile` is not used because it keeps all entries and reads names of any length, so that an archive could
+    exhaust the memory.
     """
     name, stated_size = "", None
     for _ in range(_MOST_ENTRIES):
@@ -457,7 +475,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
         except TarError as err:
             return budget.stop("log_cut_off", f"cut off or damaged ({err})")
         if info.type in {b"L", b"x"}:
-            # A name or a size for which the header of the next entry has no space.
+            # This entry holds a name or a size that does not fit into the header of the next entry.
             fields = _extra_fields(info.type, stream.exactly(min(info.size, _LARGEST_EXTRA_BYTES)))
             stream.skip(max(info.size - _LARGEST_EXTRA_BYTES, 0) + -info.size % _TAR_BLOCK_BYTES)
             name = fields.get(b"path", name.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
@@ -465,7 +483,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
             stated_size = int(size_field) if re.fullmatch(rb"\d{1,18}", size_field) else stated_size
             continue
         if info.type == b"K":
-            # the target of a link, of any length; the name of the next entry stays
+            # This entry holds the target of a link. It does not change the name of the next entry.
             stream.skip(info.size + -info.size % _TAR_BLOCK_BYTES)
             continue
         size = info.size if stated_size is None else stated_size
@@ -490,7 +508,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
 
 
 def _extra_fields(kind: bytes, extra: bytes) -> dict[bytes, bytes]:
-    """Return the fields of an extended header: a long name, or the fields of pax (``20 path=drive.mcap``)."""
+    """Return the fields of an extended header: ``path`` of a long name, or all fields of pax (``20 path=a.mcap``)."""
     if kind == b"L":
         return {b"path": extra.partition(b"\0")[0]}
     fields, at = {}, 0
@@ -503,31 +521,31 @@ def _extra_fields(kind: bytes, extra: bytes) -> dict[bytes, bytes]:
 
 
 class _FrugalFile:
-    """A file that refuses larger reads than a sound archive needs."""
+    """A file that refuses reads that are larger than a sound archive needs."""
 
     def __init__(self, file: BufferedReader) -> None:
         self._file = file
         self.tell, self.seekable, self.close = file.tell, file.seekable, file.close
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Go to a place.
+        """Move to an offset, and return it.
 
         Raises
         ------
         zipfile.BadZipFile
-            It is before the file.
+            The offset is negative.
         """
         if whence == os.SEEK_SET and offset < 0:
-            raise zipfile.BadZipFile("its directory names a place before the file")
+            raise zipfile.BadZipFile("its directory names an offset before the begin of the file")
         return self._file.seek(offset, whence)
 
     def read(self, count: int = -1, /) -> bytes:
-        """Return the next bytes.
+        """Return the next `count` bytes; fewer at the end.
 
         Raises
         ------
         zipfile.BadZipFile
-            They are too many.
+            `count` is above the limit.
         """
         if count > _LARGEST_READ_BYTES:
             raise zipfile.BadZipFile("its directory is too large")
@@ -539,7 +557,7 @@ def _zip_entries(file: BufferedReader, budget: _Budget) -> Iterator[tuple[str, _
     try:
         with zipfile.ZipFile(_FrugalFile(file)) as archive:
             for info in archive.infolist()[:_MOST_ENTRIES]:
-                # a file has a name; `is_dir` of Python 3.11 looks at its last letter
+                # An entry without a name is skipped first, because `is_dir` of Python 3.11 needs a last character.
                 if not info.filename or info.is_dir():
                     continue
                 if info.flag_bits & _ENCRYPTED:

@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.container import MessageBlock, made_ahead
+from icrtool.logs.containers.container import MessageBlock, make_ahead
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 
@@ -561,7 +561,7 @@ def test_the_block_that_is_being_made_is_ended_when_no_more_are_wanted(leave: ty
         stopped.wait(3.0)
         yield block
 
-    blocks = made_ahead(slow(), stopped.set)
+    blocks = make_ahead(slow(), stopped.set)
     assert next(blocks) is block
     assert begun.wait(3.0)
     begin = time.monotonic()

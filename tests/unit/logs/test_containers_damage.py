@@ -423,8 +423,8 @@ def test_mcap_that_describes_a_schema_twice_says_so_and_keeps_the_first(tmp_path
     found, problems = read_log(path)
     assert found == [("/a", START_NS, b"one"), ("/a", START_NS, b"two")]
     assert problems == [
-        "log.mcap: schema 1 is described twice, differently; the first description was used",
-        "log.mcap: channel 1 is described twice, differently; the first description was used",
+        "log.mcap: schema 1 has two different descriptions; the first description was used",
+        "log.mcap: channel 1 has two different descriptions; the first description was used",
     ]
 
 

@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 from icrtool.config import Config, load_config
 from icrtool.errors import ConfigError, DefinitionError, IcrToolError, LogError
 from icrtool.logs import csv_table
-from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Packed, decompress
+from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, PackedChunk, decompress
 from icrtool.logs.containers.container import Channel, Cut, MessageBlock, unpack_messages
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
 from icrtool.logs.csv_table import LONGEST_HEAD_BYTES, MOST_COLUMNS
@@ -143,7 +143,7 @@ def test_a_log_inflates_no_more_than_so_many_times() -> None:
     with pytest.raises(DecompressionError, match="inflates"):  # noqa: PT012 - how many chunks it takes is not fixed
         for _ in range(20):
             inflation.count(len(chunk), LARGEST_CHUNK_BYTES // 4)
-            packed = Packed(chunk, "zstd", LARGEST_CHUNK_BYTES // 4)
+            packed = PackedChunk(chunk, "zstd", LARGEST_CHUNK_BYTES // 4)
             done += len(decompress(packed, np.empty(packed.size + 1, np.uint8)))
     assert done <= 1.5 * LARGEST_CHUNK_BYTES
     honest = np.random.default_rng(0).bytes(1000)
@@ -253,7 +253,7 @@ def test_a_cut_holds_the_messages_of_its_times(tmp_path: Path, kind: str) -> Non
     container = open_log(path)
     cut = Cut(START_NS + 10 * 10**9, START_NS + 20 * 10**9)
     blocks = list(container.blocks(frozenset({1}), cut))
-    times = np.concatenate([cut.of(block).log_time_ns for block in blocks])
+    times = np.concatenate([cut.apply(block).log_time_ns for block in blocks])
     assert ((times - START_NS) // 10**9).tolist() == list(range(10, 20))
     assert sum(len(block.start) for block in blocks) < 25
     assert container.span_ns()[0] == START_NS

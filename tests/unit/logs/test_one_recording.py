@@ -82,7 +82,7 @@ def test_recordings_of_several_kinds_are_refused_by_name(tmp_path: Path) -> None
     with pytest.raises(LogError, match=r"holds more than one recording: old\.db3, ros1\.bag; name one of them"):
         open_log(tmp_path)
     (tmp_path / "old.db3").unlink()
-    with pytest.raises(LogError, match=r"not a ROS 2 bag directory, but ros1\.bag is in it"):
+    with pytest.raises(LogError, match=r"not a ROS 2 bag directory; it holds ros1\.bag"):
         open_log(tmp_path)
 
 

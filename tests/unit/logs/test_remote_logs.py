@@ -359,7 +359,7 @@ def test_patterns_folders_and_manifests_find_the_logs_of_a_bucket(fresh, tmp_pat
     manifest.write_text("log,robot,group\ns3://field/mon/*.mcap,husky-a200,grass\n")
     (entry,) = read_manifest(manifest)
     assert [str(place) for place in entry.places] == everything[:1]
-    with pytest.raises(LogError, match="matches nothing"):
+    with pytest.raises(LogError, match="matches this pattern"):
         find_logs_at(UrlPath("s3://field/**/*.ulg"))
 
 
