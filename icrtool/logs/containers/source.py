@@ -403,9 +403,9 @@ def find_logs_at(path: UrlPath) -> list[UrlPath]:
     LogError
         There is no log, or the logs cannot be listed.
     """
-    address = without_secrets(path.url) if path.scheme.startswith("http") else path.url
+    url = without_secrets(path.url) if path.scheme.startswith("http") else path.url
     wild = r"[*\[]" if path.scheme.startswith("http") else r"[*?\[]"
-    if not re.search(wild, address) or (not re.search(wild.replace("\\[", ""), address) and _exists(path)):
+    if not re.search(wild, url) or (not re.search(wild.replace("\\[", ""), url) and _exists(path)):
         logs = _recordings_below(path) if RemoteFile(path).is_folder else [path]
         if not logs:
             suffixes = ", ".join(sorted(LOG_SUFFIXES))

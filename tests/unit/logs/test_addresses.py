@@ -362,8 +362,8 @@ def test_an_object_store_that_answers_is_read_also_where_it_tells_nothing_of_its
 
 
 NO_ANSWERS = {
-    b"hello\n": "its server gave no answer of HTTP: Bad status line",
-    b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n": "its server gave no answer of HTTP: Invalid character",
+    b"hello\n": "its server sent an answer that is not HTTP: Bad status line",
+    b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n": "its server sent an answer that is not HTTP: Invalid character",
     b"HTTP/1.1 500 \x1b[2Jout\r\nContent-Length: 0\r\n\r\n": "its server answered 500",
 }
 
