@@ -31,7 +31,7 @@ from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, collec
 from icrtool.logs.streams.assembly import Survey, assemble, longest_part
 from icrtool.logs.streams.positions import TRANSFORM_TYPES, is_static, transform_pose
 from icrtool.logs.streams.repeats import find_repeats, first_pass
-from icrtool.logs.streams.select import fields_to_take, find_candidates
+from icrtool.logs.streams.select import find_candidates, wanted_fields
 from icrtool.records.notes import note
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import Record
@@ -133,7 +133,7 @@ def _collect(
     container: Container, config: Config, progress: Progress | None, cut: Cut
 ) -> tuple[list[TopicTable], dict[str, str]]:
     """Return the columns of all channels that may have a role, read in one pass over the log."""
-    wanted = fields_to_take(container.channels, config)
+    wanted = wanted_fields(container.channels, config)
     static = frozenset(channel.id for channel in container.channels if is_static(channel))
     cut = cut._replace(whole=static) if cut != WHOLE else cut
     tables, unread = collect_tables(container, wanted, cut, progress)
@@ -188,7 +188,7 @@ def collect_tables(
                     unread[by_id[number].topic] = str(err)
             if progress is not None:
                 progress(container.share_read())
-    _report_definitions(container, [by_id[number] for number, one in collectors.items() if one is not None])
+    _report_definitions(container, [by_id[number] for number, collector in collectors.items() if collector is not None])
     for number in wanted.keys() - collectors.keys():
         by_topic.setdefault(topics[number], TopicCollector(by_id[number]))
     in_order = dict.fromkeys(topics[number] for number in wanted)
@@ -388,9 +388,11 @@ def survey_document(survey: Survey) -> SurveyDocument:
     candidates: dict[Role, tuple[SurveyedSource, ...]] = {}
     for role, sources in survey.candidates.by_role().items():
         found = []
-        for one in sources:
-            delay = f"{one.stamps.delay_ns / 1e6:z.1f} ms"
-            clock = one.stamps.note or f"header stamps, {delay} before log time"
-            found.append(SurveyedSource(str(one.topic), str(one.message_type), one.why, one.problem or None, clock))
+        for source in sources:
+            delay = f"{source.stamps.delay_ns / 1e6:z.1f} ms"
+            clock = source.stamps.note or f"header stamps, {delay} before log time"
+            found.append(
+                SurveyedSource(str(source.topic), str(source.message_type), source.why, source.problem or None, clock)
+            )
         candidates[role] = tuple(found)
     return SurveyDocument(survey.inputs, survey.transfer or None, tuple(topics), candidates)

@@ -53,12 +53,12 @@ def scorable_topics(survey: SurveyDocument, used: Iterable[str]) -> tuple[str, .
     """Return the topics of a log with poses that are neither goals nor `used` as reference."""
     taken = set(used)
     return tuple(
-        one.topic
-        for one in survey.topics
-        if one.message_type in POSE_FIELDS
-        and one.topic not in taken
-        and one.messages != 0
-        and not GOAL_WORDS.search(one.topic)
+        topic.topic
+        for topic in survey.topics
+        if topic.message_type in POSE_FIELDS
+        and topic.topic not in taken
+        and topic.messages != 0
+        and not GOAL_WORDS.search(topic.topic)
     )
 
 
@@ -86,7 +86,7 @@ def read_topic_poses(path: str | Path, topics: Sequence[str], progress: Progress
         raise ConfigError("score", f"{path} is a table, which has no topics", "name a bag or MCAP file")
     with contextlib.closing(open_log(path, progress)) as container:
         chosen = _channels_of(topics, container.channels)
-        wanted = {one.id: _fields_of(one) for one in chosen}
+        wanted = {channel.id: _fields_of(channel) for channel in chosen}
         tables, unread = collect_tables(container, wanted, progress=progress)
     by_topic = {str(table.topic): table for table in tables}
     poses = []
@@ -110,17 +110,17 @@ def _channels_of(topics: Sequence[str], channels: Sequence[Channel]) -> list[Cha
     """
     chosen: list[Channel] = []
     by_topic: dict[str, list[Channel]] = {}
-    for one in channels:
-        by_topic.setdefault(str(one.topic), []).append(one)
+    for channel in channels:
+        by_topic.setdefault(str(channel.topic), []).append(channel)
     poses = [name for name, of_name in by_topic.items() if _fields_of(of_name[0])]
     held = f"the log's poses are in {listed(poses)}" if poses else "the log has no topic of poses"
     for topic in topics:
         if topic not in by_topic:
             raise ConfigError("score", f"the log has no topic {topic}", f"{did_you_mean(topic, poses)}{held}")
-        for one in by_topic[topic]:
-            if not _fields_of(one):
-                raise ConfigError("score", f"{topic} is a {one.message_type}, which holds no pose", held)
-            chosen.append(one)
+        for channel in by_topic[topic]:
+            if not _fields_of(channel):
+                raise ConfigError("score", f"{topic} is a {channel.message_type}, which holds no pose", held)
+            chosen.append(channel)
     return chosen
 
 
@@ -137,16 +137,16 @@ def _poses_of(table: TopicTable, log: Path) -> TopicPoses:
     kind = str(table.message_type)
     if table.message_type in TRANSFORM_TYPES:
         table = every_transform_pose(table)
-    x, y, *q = (number_of(table, one, needed=True) for one in POSE_FIELDS[table.message_type])
+    x, y, *q = (number_of(table, field, needed=True) for field in POSE_FIELDS[table.message_type])
     with np.errstate(over="ignore", invalid="ignore"):
-        norm = np.sqrt(sum(one * one for one in q))
+        norm = np.sqrt(sum(component * component for component in q))
         usable: Bools = (norm > LEAST_QUATERNION) & (norm < LARGEST_QUATERNION) & np.isfinite(x) & np.isfinite(y)
     stamps = stamp_rows(table)
     order = stamps.header_ns if stamps.header_ns is not None else stamps.log_ns
     rows, _, _ = increasing_rows(order, usable)
     if len(order[rows]) < 2:
         raise DataError(log, f"{table.topic} holds {len(order[rows])} usable poses", "at least two are needed")
-    ahead, left, _ = turned_axis(0, *(one[rows] / norm[rows] for one in q))
+    ahead, left, _ = turned_axis(0, *(component[rows] / norm[rows] for component in q))
     # Seen from above, y is left of x; in a frame with z down, y is right of x.
     side = 1.0 if frame_convention(table)[0] == "ned" else -1.0
     heading = unwrapped(np.arctan2(side * left, ahead))

@@ -1,1 +1,1 @@
-"""What topics mean: tables of columns to candidates for wheels, position and heading, and the choice among them."""
+"""Candidates for wheels, position and heading from the tables of topics, and the choice among them."""

@@ -1,4 +1,4 @@
-"""The chosen sources as a log: samples in the frames of `icrtool`, by one clock, with what a user must know of them."""
+"""Assembly of a log from the chosen sources: samples in the frames of `icrtool`, on one clock, with findings."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from icrtool.logs.streams.sources import (
     Source,
     StampedRows,
     WheelSource,
-    as_replayed,
-    by_header,
-    by_log,
     increasing_rows,
+    put_on_replay_clock,
     replay_speed,
     share_clock,
     stamp_rows,
+    use_header_stamps,
+    use_log_times,
 )
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.records.notes import Note, note, notes_about
@@ -60,22 +60,28 @@ from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText, listed
 
 MOST_PIECES = 10.0
-"""Largest mean number of pieces into which sorting cuts a stretch of messages. With more, it was recorded while times
-repeated."""
+"""Largest mean number of pieces of `BackwardStep` with which samples can be sorted. More pieces show that the same log
+times occurred twice."""
 
-FAR_NS = 100_000_000
-"""Largest delay of log time after header stamps [ns] with which these are used together with log times of other
-streams."""
+LONGEST_LOG_DELAY_NS = 100_000_000
+"""Largest delay of log time after header stamps with which the header stamps of one stream are used together with the
+log times of another [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """A log after one pass: its channels, all candidates, the messages that could not be read, its files.
+    """Content of a log after one pass over its messages.
 
     Attributes
     ----------
-    tables : columns that no candidate holds: stamps, turn rates, static transforms
-    transfer : how much came over a connection, in words; empty for a file on disk
+    name : name of the log
+    path : path of the log in errors
+    channels : all channels of the log
+    tables : columns that are in no candidate: stamps, turn rates, static transforms
+    candidates : the sources that may feed a role
+    problems : findings about data that could not be read
+    inputs : files of the log with their SHA-256
+    transfer : text about the data that was transferred over a connection; empty for a file on disk
     """
 
     name: LogText
@@ -89,23 +95,35 @@ class Survey:
 
 
 def assemble(survey: Survey, config: Config) -> RobotLog:
-    """Return the log with its streams chosen and converted; errors as `read_log`."""
-    lost = _lost(survey)
+    """Return the log with its streams chosen and converted to the frames and units of `icrtool`.
+
+    Raises
+    ------
+    LogError
+        No message of the used topics could be read.
+    ConfigError
+        A configured topic, joint or unit does not fit the log.
+    MissingStreamError
+        The log has no wheels or no positions.
+    DataError
+        A stream cannot be used.
+    """
+    lost = _unreadable_text(survey)
     if lost and survey.tables and not any(len(table) or table.unreadable for table in survey.tables):
         why = f"no message of {listed([table.topic for table in survey.tables], 3)} could be read: {lost}"
         raise LogError(survey.path, why, "copy the log again from where it was recorded")
     choice = choose_streams(survey.candidates, config, survey.path, survey.channels, lost)
-    log = _assemble(survey, config, choice)
+    log = _assemble_choice(survey, config, choice)
     others = []
     for other in other_references(survey.candidates, choice, config):
-        # a reference that cannot be used is no alternative
+        # A reference that cannot be used is left out.
         with contextlib.suppress(DataError):
-            others.append(_assemble(survey, config, other))
+            others.append(_assemble_choice(survey, config, other))
     return replace(log, other_references=tuple(others)) if others else log
 
 
-def _lost(survey: Survey) -> str:
-    """Return the first thing that could not be read of a log, and how many more there are; empty where all was read."""
+def _unreadable_text(survey: Survey) -> str:
+    """Return the first finding about unreadable data, and the number of further ones; empty if all was read."""
     if not survey.problems:
         return ""
     first, *others = survey.problems
@@ -113,33 +131,40 @@ def _lost(survey: Survey) -> str:
     return f"{text} (icrtool info lists {len(others)} more)" if others else text
 
 
-def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
-    """Return the log with the streams of a choice, converted."""
+def _assemble_choice(survey: Survey, config: Config, choice: Choice) -> RobotLog:
+    """Return the log with the streams of a choice, converted; raise as `assemble`."""
     candidates, name = survey.candidates, survey.name
     motion, position, source = choice.wheels, choice.gnss, choice.heading
     chosen: dict[Role, Source] = {"wheels": motion, "gnss": position}
     if source is not None:
         chosen["heading"] = source
-    retime, notes = _clock_of(chosen, config)
-    chosen = {role: replace(one, stamps=retime(one.stamps)) for role, one in chosen.items()}
+    retime, notes = _choose_clock(chosen, config)
+    chosen = {
+        role: replace(chosen_source, stamps=retime(chosen_source.stamps)) for role, chosen_source in chosen.items()
+    }
     motion, position = replace(motion, stamps=retime(motion.stamps)), replace(position, stamps=retime(position.stamps))
     source = None if source is None else replace(source, stamps=retime(source.stamps))
-    clock = common_clock([one.stamps for one in chosen.values()])
+    clock = common_clock([chosen_source.stamps for chosen_source in chosen.values()])
     if clock == "log":
         far = "one stream has no header stamps, and the header stamps of another are far from log time"
         notes.append(note("log_time_used", f"{far}; log time is used for all streams"))
-    notes += clock_notes([(role, one.stamps) for role, one in chosen.items()], name)
-    position, source, of_bursts = _spread(position, source, clock)
-    notes += of_bursts
-    notes += _far_datum(position, config)
-    gnss, datum = _fixes(position, config, clock)
-    heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock)
+    notes += clock_notes([(role, chosen_source.stamps) for role, chosen_source in chosen.items()], name)
+    position, source, burst_notes = _spread_stamps(position, source, clock)
+    notes += burst_notes
+    notes += _datum_notes(position, config)
+    gnss, datum = _local_fixes(position, config, clock)
+    heading, convention = (NO_HEADINGS, "") if source is None else _convert_headings(source, config, clock)
     wheels, wheel_notes = wheel_samples(motion, motion.stamps.on(clock), config, name)
     notes += wheel_notes + ignored_joints(motion, config)
-    notes += [note(reported.code, f"{one.topic}: {reported.text}") for one in chosen.values() for reported in one.notes]
+    notes += [
+        note(reported.code, f"{chosen_source.topic}: {reported.text}")
+        for chosen_source in chosen.values()
+        for reported in chosen_source.notes
+    ]
     if source is None:
         notes += [
-            note("heading_unusable", f"{one.topic} gives no heading: {one.problem}") for one in candidates.heading
+            note("heading_unusable", f"{candidate.topic} gives no heading: {candidate.problem}")
+            for candidate in candidates.heading
         ]
     notes += _unreadable_notes(survey.tables, chosen.values())
     antenna = antenna_place(survey.tables, position.topic)
@@ -149,22 +174,32 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         "gnss": (gnss, f"; {place} (/tf_static)" if place else ""),
         "heading": (heading, f"; {convention}"),
     }
-    streams = tuple(_stream_choice(role, one, *read[role], clock) for role, one in chosen.items())
+    streams = tuple(
+        _stream_choice(role, chosen_source, *read[role], clock) for role, chosen_source in chosen.items()
+    )
     # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
     others = [
-        one for one in candidates.gnss if one.geodetic is not None and not one.problem and one.topic != position.topic
+        receiver
+        for receiver in candidates.gnss
+        if receiver.geodetic is not None and not receiver.problem and receiver.topic != position.topic
     ]
-    others = [replace(one, stamps=retime(one.stamps)) for one in others]
-    receivers = [OtherReceiver(one.topic, _fixes(one, config, clock, datum)[0]) for one in others if datum is not None]
+    others = [replace(receiver, stamps=retime(receiver.stamps)) for receiver in others]
+    receivers = [
+        OtherReceiver(receiver.topic, _local_fixes(receiver, config, clock, datum)[0])
+        for receiver in others
+        if datum is not None
+    ]
     rows_of_role: dict[str, StampedRows] = {
         table.topic: retime(stamp_rows(table)) for table in survey.tables if table.message_type == GYRO_TYPE
     }
     gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, rows_of_role)
-    gyros, degrees = _gyros(inertial_units(survey.tables, GYRO_AXES, clock, rows_of_role), heading, gnss)
+    gyros, degrees = _convert_gyros(inertial_units(survey.tables, GYRO_AXES, clock, rows_of_role), heading, gnss)
     if gyro is not None and gyro.topic in degrees:
         gyro = replace(gyro, rate_radps=gyro.rate_radps * DEGREE)
     gyro = None if gyro is not None and is_too_fast(gyro.rate_radps[:, None]) else gyro
-    notes += [note("gyro_in_degrees", f"{one}: its turn rates are in deg/s, not rad/s: converted") for one in degrees]
+    notes += [
+        note("gyro_in_degrees", f"{topic}: its turn rates are in deg/s, not rad/s: converted") for topic in degrees
+    ]
     log = RobotLog(
         name, wheels, gnss, heading, datum, streams, survey.inputs, dict(position.rejected),
         (*survey.problems, *notes_about(name, notes)), antenna, gyro, gyros, tuple(receivers),
@@ -176,7 +211,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
 def _unreadable_notes(tables: Iterable[TopicTable], chosen: Iterable[Source]) -> list[Note]:
     """Return a finding for each chosen topic with messages that do not fit their type."""
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in tables if table.unreadable}
-    used_topics = [topic_of_side(side) for one in chosen for side in one.topic.split(" + ")]
+    used_topics = [topic_of_side(side) for source in chosen for side in source.topic.split(" + ")]
     return [
         note("messages_unreadable", f"{topic}: {unreadable[topic]} messages do not fit their message type; left out")
         for topic in dict.fromkeys(used_topics)
@@ -185,7 +220,12 @@ def _unreadable_notes(tables: Iterable[TopicTable], chosen: Iterable[Source]) ->
 
 
 def _stream_choice(role: Role, source: Source, samples: Samples, detail: str, clock: Clock) -> StreamChoice:
-    """Return what run.json states of a stream: its source, number, rate and clock; `detail` is added to the reason."""
+    """Return the entry of a stream in run.json: its source, number of samples, rate and clock.
+
+    Parameters
+    ----------
+    detail : text that is added to the reason of the choice
+    """
     used = clock if source.stamps.header_ns is not None else "log"
     rate, jitter = rate_and_jitter(samples.stamp_ns)
     return StreamChoice(
@@ -193,8 +233,12 @@ def _stream_choice(role: Role, source: Source, samples: Samples, detail: str, cl
     )
 
 
-def _clock_of(chosen: Mapping[Role, Source], config: Config) -> tuple[Callable[[StampedRows], StampedRows], list[Note]]:
-    """Return a function that puts stamps on the configured clock, or on the clock of all headers; and a note.
+def _choose_clock(
+    chosen: Mapping[Role, Source], config: Config
+) -> tuple[Callable[[StampedRows], StampedRows], list[Note]]:
+    """Return a function that puts stamps on the clock to use, and a finding about this clock.
+
+    The clock is the configured one; with ``auto``, a clock of header stamps that all streams share is used.
 
     Raises
     ------
@@ -202,32 +246,32 @@ def _clock_of(chosen: Mapping[Role, Source], config: Config) -> tuple[Callable[[
         Header stamps are configured and a stream has none that can be used.
     """
     if config.topics.clock == "log":
-        return by_log, []
+        return use_log_times, []
     if config.topics.clock == "header":
-        for one in chosen.values():
-            if one.stamps.header_ns is None and one.stamps.far_ns is None:
-                why = f"{one.topic} has no header stamps that can be used ({one.stamps.note})"
+        for stream in chosen.values():
+            if stream.stamps.header_ns is None and stream.stamps.far_ns is None:
+                why = f"{stream.topic} has no header stamps that can be used ({stream.stamps.note})"
                 raise ConfigError("topics.clock", why, "set it to auto or log")
-        return by_header, []
-    far = [one.stamps for one in chosen.values() if one.stamps.far_ns is not None]
-    others = [one for one in chosen.values() if one.stamps.far_ns is None]
-    if share_clock(far) and all(one.stamps.note == NO_HEADER for one in others):
+        return use_header_stamps, []
+    far = [stream.stamps for stream in chosen.values() if stream.stamps.far_ns is not None]
+    others = [stream for stream in chosen.values() if stream.stamps.far_ns is None]
+    if share_clock(far) and all(stream.stamps.note == NO_HEADER for stream in others):
         speed = replay_speed(far[0])
-        goes = f", which goes {speed:.3g} times as fast as log time (a replay at that speed, or a simulation)"
+        pace = f", which runs {speed:.3g} times as fast as log time (a replay at that speed, or a simulation)"
         if not others:
-            why = f"{far[0].note} and are of one clock in all streams{goes if speed != 1.0 else ', as simulated time'}"
-            return by_header, [note("header_clock", f"{why}: they are used")]
+            clock = f"one clock in all streams{pace if speed != 1.0 else ', such as simulated time'}"
+            return use_header_stamps, [note("header_clock", f"{far[0].note}, and come from {clock}: they are used")]
         if speed != 1.0:
-            without = ", ".join(one.topic for one in others)
-            why = f"{far[0].note} and are of one clock{goes}: they are used, and {without} is put on that clock"
-            return lambda rows: as_replayed(rows, far[0]), [note("header_clock", why)]
+            without = ", ".join(stream.topic for stream in others)
+            why = f"{far[0].note}, and come from one clock{pace}: they are used, and {without} is put on that clock"
+            return lambda rows: put_on_replay_clock(rows, far[0]), [note("header_clock", why)]
     return lambda rows: rows, []
 
 
-def _gyros(
+def _convert_gyros(
     units: Iterable[tuple[TopicTable, Ints, Sequence[Floats]]], heading: HeadingSamples, gnss: PositionFixes
 ) -> tuple[tuple[GyroAxes, ...], list[str]]:
-    """Return the inertial units with their rates in rad/s, and the topics that sent deg/s."""
+    """Return the inertial units with their turn rates in rad/s, and the topics whose rates were in deg/s."""
     gyros, degrees = list[GyroAxes](), list[str]()
     for table, stamps, axes in units:
         rates = np.array(axes).T
@@ -240,12 +284,17 @@ def _gyros(
 
 
 def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[Note]:
-    """Yield findings about clocks: one for all clocks that were set, one for each clock that cannot be used.
+    """Yield findings about clocks that were set, and about streams whose header stamps cannot be used.
+
+    Parameters
+    ----------
+    streams : role and stamps of each stream
+    name : name of the log in errors
 
     Raises
     ------
     DataError
-        The clock was set back, and times repeat: nothing shows which of two samples came first.
+        The clock was set back so far that the same log times occur twice, and samples cannot be put in order.
     """
     back = [
         (rows.backward_step, role)
@@ -253,19 +302,19 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         if rows.backward_step.pieces > MOST_PIECES or rows.backward_step.step_ns > DISORDER_NS
     ]
     if back:
-        # The largest step among the streams in which times repeat, if there are any: they decide what can be done.
-        largest = max(back, key=lambda one: (one[0].pieces > MOST_PIECES, one[0].step_ns))[0]
+        # Streams in which the same times occur twice come first, because they cannot be sorted.
+        largest = max(back, key=lambda step_of_role: (step_of_role[0].pieces > MOST_PIECES, step_of_role[0].step_ns))[0]
         moment, roles = np.datetime64(largest.before_ns // 10**9, "s"), ", ".join(role for _, role in back)
         why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment}Z ({roles})"
         if largest.pieces <= MOST_PIECES:
             cause = "the clock was set back, or messages are stored out of order; all are used, sorted by time"
             yield note("clock_set", f"{why}: {cause}; if it was set back, fit each part alone (--from, --to)")
         elif largest.step_ns <= DISORDER_NS:
-            mixed = "samples of that time are mixed, which makes errors there too large"
+            mixed = "samples of that time are mixed, so that errors there are too large"
             reported = f"{why}: the clock was set back while recording, and {mixed}; fit each part alone (--from, --to)"
             yield note("clock_set", reported)
         else:
-            raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
+            raise DataError(name, why, "the same times occur twice; samples cannot be sorted; cut the recording there")
     if clocks_set := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:
         size_ns, is_back, before_ns = max(clocks_set)[0]
         sense, setting = ("back", "back") if is_back else ("ahead", "forward")
@@ -277,27 +326,35 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         if rows.note and rows.note not in (NO_HEADER, BY_LOG):
             yield note("log_time_used", f"{role}: {rows.note}; log time is used")
         if rows.replaced > 1:
-            counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
+            counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps come from another clock"
             yield note("log_time_used", f"{role}: {counted}; log time is used for them")
 
 
 def common_clock(streams: Sequence[StampedRows]) -> Clock:
-    """Return the clock for streams that are used together: header stamps or log time.
+    """Return the clock of streams that are used together: ``header`` or ``log``.
 
-    Where one stream has only log times and the header stamps of another are far from log time, all use log time.
+    If one stream has only log times, and the header stamps of another are far from log time, it is ``log``.
     """
     delays = [rows.delay_ns for rows in streams if rows.header_ns is not None]
-    return "log" if len(delays) < len(streams) and any(abs(delay) > FAR_NS for delay in delays) else "header"
+    return (
+        "log" if len(delays) < len(streams) and any(abs(delay) > LONGEST_LOG_DELAY_NS for delay in delays) else "header"
+    )
 
 
-FAR_DEG = 0.2
-"""A fix this far from the median of all, about 20 km, is no origin of the local plane."""
+LARGEST_DATUM_OFFSET_DEG = 0.2
+"""Largest distance from the median of all fixes of a fix that may be the origin of the local plane [deg], about 20
+km."""
 
 
-def _fixes(
+def _local_fixes(
     source: PositionSource, config: Config, clock: Clock, given: Datum | None = None
 ) -> tuple[PositionFixes, Datum | None]:
-    """Return positions in the local plane about the datum: `given`, else the configured one, else the first fix."""
+    """Return positions in the local plane [m], north and east of its origin, and this origin.
+
+    Parameters
+    ----------
+    given : the origin; None: the configured one, else the first fix
+    """
     stamps = source.stamps.on(clock)
     rows = np.flatnonzero(source.usable)
     rows = rows[np.argsort(stamps[rows], kind="stable")]
@@ -307,33 +364,33 @@ def _fixes(
 
         latitude, longitude, height = source.geodetic[rows].T
         if datum is None:
-            # a bad first fix would lay the plane far away
+            # With an outlier as first fix, the origin would be far from the drive.
             apart = np.abs(latitude - np.median(latitude)) + np.abs(longitude - np.median(longitude))
-            row = int(np.argmax(apart < FAR_DEG)) if (apart < FAR_DEG).any() else 0
+            row = int(np.argmax(apart < LARGEST_DATUM_OFFSET_DEG)) if (apart < LARGEST_DATUM_OFFSET_DEG).any() else 0
             first = float(latitude[row]), float(longitude[row])
-            given_datum = None if _far_datum(source, config) else config.frames.datum
+            given_datum = None if _datum_notes(source, config) else config.frames.datum
             datum = Datum(*(given_datum or first), float(height[0]))
         origin = datum.latitude_deg, datum.longitude_deg, datum.height_m
         north, east, _ = geodetic2ned(latitude, longitude, height, *origin)
     else:
         north, east = np.asarray(source.metric, np.float64)[rows].T
     north, east, var_north, var_east, covariance = (
-        np.ascontiguousarray(one, np.float64) for one in (north, east, *source.variance[rows].T)
+        np.ascontiguousarray(column, np.float64) for column in (north, east, *source.variance[rows].T)
     )
     stated = None if source.stated_class is None else source.stated_class[rows]
     return PositionFixes(stamps[rows], north, east, var_north, var_east, covariance, stated), datum
 
 
 FAR_TURN_RAD, FAR_DATUM_M = math.radians(0.5), 285e3
-"""Turn of a local plane at the fixes, and distance, above which its origin is too far away [rad, m]. At this distance
-the plane is 0.1 % too small; a smaller turn is found and corrected with the heading."""
+"""Largest turn of the local plane at the fixes [rad], and largest distance of its origin from the fixes [m]. At this
+distance lengths in the plane are 0.1 % too small. A smaller turn is found and corrected with the heading."""
 
 MEAN_EARTH_RADIUS_M = 6_371_000.0
 """Mean radius of the earth [m]."""
 
 
-def _far_datum(source: PositionSource, config: Config) -> list[Note]:
-    """Return a note where the configured origin is too far from the fixes for one plane; none where it is near.
+def _datum_notes(source: PositionSource, config: Config) -> list[Note]:
+    """Return a finding if the configured origin is too far from the fixes for one plane, else an empty list.
 
     Notes
     -----
@@ -349,19 +406,19 @@ def _far_datum(source: PositionSource, config: Config) -> list[Note]:
     far_m = 2.0 * MEAN_EARTH_RADIUS_M * math.asin(min(math.sqrt(math.sin((lat - lat_0) / 2) ** 2 + middle), 1.0))
     if abs(turn) <= FAR_TURN_RAD and far_m <= FAR_DATUM_M:
         return []
-    what = f"frames.datum lies {far_m / 1e3:,.0f} km from the fixes ({latitude:.4f}, {longitude:.4f})"
+    distance = f"frames.datum lies {far_m / 1e3:,.0f} km from the fixes ({latitude:.4f}, {longitude:.4f})"
     plane = f"its local plane is turned by {abs(math.degrees(turn)):.1f}° there"
-    why = f"{what}, and {plane}: the first fix is the datum instead; correct frames.datum, [latitude, longitude]"
+    why = f"{distance}, and {plane}: the first fix is the datum instead; correct frames.datum, [latitude, longitude]"
     return [note("datum_far", why)]
 
 
-def _spread(
+def _spread_stamps(
     position: PositionSource, heading: HeadingSource | None, clock: Clock
 ) -> tuple[PositionSource, HeadingSource | None, list[Note]]:
-    """Return the sources with their stamps spread where positions come several at a time or share a stamp, and a note.
+    """Return the sources with the stamps of packets of positions spread over time, and a finding about packets.
 
-    Rows that are not used keep their stamps. Headings of the topic of the positions have the stamps of their positions
-    if both are in the same messages; if they are sentences in messages of their own, they are spread by themselves.
+    Rows that are not used keep their stamps. Headings in the messages of the positions get the stamps of the positions.
+    Headings in other messages of the same topic (NMEA sentences) are spread separately.
     """
     rows, stamps = np.flatnonzero(position.usable), position.stamps
     if position.geodetic is not None:
@@ -369,30 +426,30 @@ def _spread(
         place = MEAN_EARTH_RADIUS_M * (latitude + 1j * longitude * np.cos(latitude))
     else:
         place = np.asarray(position.metric, np.float64)[rows] @ np.array([1.0, 1j])
-    by_header = clock == "header" and stamps.header_ns is not None
-    bursts = spread_positions(stamps.on(clock)[rows], place, measured=by_header)
+    uses_headers = clock == "header" and stamps.header_ns is not None
+    bursts = spread_positions(stamps.on(clock)[rows], place, measured=uses_headers)
     if not (text := bursts.sentence("fixes" if position.geodetic is not None else "poses")):
         return position, heading, []
     if heading is not None and (heading.topic, heading.message_type) == (position.topic, position.message_type):
-        own, used = bursts, position.usable
+        heading_bursts, used = bursts, position.usable
         if not np.array_equal(heading.stamps.on(clock), stamps.on(clock)):
-            own, used = spread_bursts(heading.stamps.on(clock)[heading.usable]), heading.usable
-            own = own.as_shared() if bursts.shared else own
-        heading = replace(heading, stamps=_moved(heading.stamps, used, own.stamp_ns, clock))
-    moved = _moved(stamps, position.usable, bursts.stamp_ns, clock)
-    return replace(position, stamps=moved), heading, [note("fix_bursts", f"{position.topic}: {text}")]
+            heading_bursts, used = spread_bursts(heading.stamps.on(clock)[heading.usable]), heading.usable
+            heading_bursts = heading_bursts.as_shared() if bursts.shared else heading_bursts
+        heading = replace(heading, stamps=_with_stamps(heading.stamps, used, heading_bursts.stamp_ns, clock))
+    spread = _with_stamps(stamps, position.usable, bursts.stamp_ns, clock)
+    return replace(position, stamps=spread), heading, [note("fix_bursts", f"{position.topic}: {text}")]
 
 
-def _moved(rows: StampedRows, used: Bools, stamp_ns: Ints, clock: Clock) -> StampedRows:
-    """Return stamps of which those used (n,) are replaced on a clock; the others stay as they are."""
-    moved = rows.on(clock).copy()
-    moved[used] = stamp_ns
-    is_header = clock == "header" and rows.header_ns is not None
-    return replace(rows, header_ns=moved) if is_header else replace(rows, log_ns=moved)
+def _with_stamps(rows: StampedRows, used: Bools, stamp_ns: Ints, clock: Clock) -> StampedRows:
+    """Return stamps in which the stamps of the used rows (n,) by a clock are replaced by other stamps (m,) [ns]."""
+    stamps = rows.on(clock).copy()
+    stamps[used] = stamp_ns
+    uses_headers = clock == "header" and rows.header_ns is not None
+    return replace(rows, header_ns=stamps) if uses_headers else replace(rows, log_ns=stamps)
 
 
-def _headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[HeadingSamples, str]:
-    """Return headings clockwise from north, and a text on how the convention is known."""
+def _convert_headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[HeadingSamples, str]:
+    """Return headings clockwise from north [rad], and a text about their convention and how it is known."""
     convention = _heading_sensor(source, config).convention
     why = source.convention_why if config.frames.heading == "auto" else "configured"
     stamps = source.stamps.on(clock)
@@ -402,31 +459,32 @@ def _headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[Head
 
 
 def _heading_sensor(source: HeadingSource, config: Config) -> HeadingSensor:
-    """Return the topic of a heading, and the convention that it is read with."""
+    """Return the topic of a heading, with the convention by which its angles are read."""
     convention = source.convention if config.frames.heading == "auto" else config.frames.heading
     return HeadingSensor(source.topic, source.message_type, convention)
 
 
 MOST_NOT_FINITE = 0.01
-"""Largest share of wheel samples without a number that is not reported."""
+"""Share of wheel samples that are not finite above which they are reported."""
 
 
 def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: str) -> tuple[WheelSamples, list[Note]]:
-    """Return wheel speeds held over each interval, in the unit of the log, and findings.
+    """Return wheel speeds, each valid until the next sample, in the unit of the log per second, and findings.
 
-    Returns
-    -------
-    samples, findings
+    Parameters
+    ----------
+    stamps : (n,) stamps of the rows of `motion` [ns]
+    log_name : name of the log in errors
 
     Raises
     ------
     ConfigError
-        A body twist whose track width is not configured, or a configured quantity that the topic does not have.
+        The topic holds a body twist and no track width is configured, or lacks the configured quantity.
     DataError
-        Fewer than two usable samples.
+        There are fewer than two usable samples.
     """
     topic, notes = motion.topic, list[Note]()
-    left, right, unit, is_position = _pick(motion, config)
+    left, right, unit, is_position = _pick_quantity(motion, config)
     if not _is_doubled(stamps, left, right):
         bursts = spread_bursts(stamps)
         stamps = bursts.stamp_ns
@@ -461,21 +519,27 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
 
 
 def _is_doubled(stamps: Ints, left: Floats, right: Floats) -> bool:
-    """Return whether samples with the stamp of the one before mostly have its values: messages recorded twice."""
+    """Return whether most samples with the stamp of the sample before also have its values: recorded twice."""
     again = np.flatnonzero(np.diff(stamps) == 0)
     moving = again[(left[again] != 0.0) | (right[again] != 0.0)]
     same = (left[moving] == left[moving + 1]) & (right[moving] == right[moving + 1])
     return len(moving) > 0 and float(same.mean()) > 0.5
 
 
-def _pick(motion: WheelSource, config: Config) -> tuple[Floats, Floats, WheelUnit, bool]:
-    """Return left, right, their unit, and whether they are positions."""
+def _pick_quantity(motion: WheelSource, config: Config) -> tuple[Floats, Floats, WheelUnit, bool]:
+    """Return the numbers of the left and of the right side (n,), their unit, and whether they are positions.
+
+    Raises
+    ------
+    ConfigError
+        The topic lacks the configured quantity, or the track width that it needs is not configured.
+    """
     if motion.twist is not None:
         given = config.wheels.twist_width_m
         width = given if given is not None else config.robot.track_width_m
         if width is None:
             why = f"needed to convert the body twist of {motion.topic} to wheel speeds"
-            raise ConfigError("robot.track_width_m", why, "give it, or --robot NAME")
+            raise ConfigError("robot.track_width_m", why, "set robot.track_width_m, or give --robot NAME")
         if motion.travelled is not None:
             travel, turn = motion.travelled.T
             return travel - turn * width / 2, travel + turn * width / 2, "m", True
@@ -487,7 +551,7 @@ def _pick(motion: WheelSource, config: Config) -> tuple[Floats, Floats, WheelUni
         raise ConfigError("wheels.quantity", f"{motion.topic} has no {wanted}", "leave it on auto")
     stuck = False
     if wanted == "auto" and positions is not None and speeds is not None:
-        # Some drivers leave the position at zero.
+        # Some drivers leave the position at 0 while the wheels turn.
         finite = np.isfinite(positions[0]) & np.isfinite(positions[1])
         stuck = int(np.count_nonzero(finite)) < len(finite) / 2 or any(
             np.ptp(travelled[finite]) == 0.0 and np.nanmax(np.abs(speed)) > 0.0
@@ -511,19 +575,20 @@ WHEEL_UNITS: dict[str, tuple[float, WheelUnit]] = {
     "rad/s": (1.0, "rad"), "deg/s": (math.radians(1.0), "rad"), "rpm": (2 * math.pi / 60, "rad"),
     "m/s": (1.0, "m"), "counts": (1.0, "counts"),
 }  # fmt: skip
-"""Configured units of wheels: the factor of the numbers, and the unit of the products, per second for speeds."""
+"""Factor that converts numbers in each configured unit of wheels, and the unit of the products (per second for
+speeds)."""
 
 PAUSE_S = 600.0
-"""Longest interval between samples that is not reported [s]."""
+"""Interval between samples above which it is reported [s]."""
 
 LONGEST_PAUSE_S = 86_400.0
-"""Interval between samples from which a log counts as two recordings [s]."""
+"""Interval between samples above which a log counts as two recordings [s]."""
 
 
 def longest_part(log: RobotLog) -> RobotLog:
-    """Return a log without samples of another clock, and with a finding where its clock may have been set forward.
+    """Return the longest part of a log without a pause of `LONGEST_PAUSE_S`, with findings about pauses.
 
-    Of parts at least `LONGEST_PAUSE_S` apart, the part with the most wheel samples and positions is kept.
+    The part with the most wheel samples is kept, among the parts with at least two positions.
     """
     stamps, fixes, pause_ns = log.wheels.stamp_ns, log.gnss.stamp_ns, int(LONGEST_PAUSE_S * 1e9)
     ends = np.append(np.flatnonzero(np.diff(stamps) > pause_ns), len(stamps) - 1)

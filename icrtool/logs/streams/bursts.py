@@ -1,4 +1,4 @@
-"""Samples that arrive several at a time: a serial adapter or a radio link holds them back and passes on packets."""
+"""Spreading of stamps over time for samples that arrive in packets, as over a serial adapter or a radio link."""
 
 from __future__ import annotations
 
@@ -9,28 +9,30 @@ import numpy as np
 from icrtool.kernels.arrays import Complexes, Ints
 
 SHORT_INTERVAL = 0.2
-"""Part of the mean interval. Samples that arrive closer together than this are of one packet: no sensor that samples
-at a steady rate has such an interval, and random arrivals have one in six of them."""
+"""Interval, as a share of the mean interval, below which two samples belong to one packet. A sensor with a steady rate
+has no such interval; of random arrivals one interval in six is as short."""
 
 LEAST_BURST_SHARE = 0.02
-"""Share of the intervals that are short, from which on stamps are spread. Damage makes single ones."""
+"""Smallest share of short intervals with which stamps are spread. Damaged messages cause single short intervals."""
 
 PAUSE_IN_LONGEST = 3.0
-"""Intervals longer than this many times the 98th percentile are gaps, and no part of the mean interval."""
+"""Interval, as a multiple of the 98th percentile of the intervals, above which it is a gap. Gaps are left out of the
+mean interval."""
 
 LONGEST_STEP = 1.5
-"""Usual intervals that samples of a packet are spread apart at most: after a gap, a packet holds its end alone."""
+"""Largest interval between the spread samples of a packet, as a multiple of the usual interval. The first packet after
+a gap holds only the last samples of the gap."""
 
 
 class Bursts(NamedTuple):
-    """Stamps of samples that arrive in packets, spread as they were measured.
+    """Stamps of samples that arrive in packets, spread over the times at which they were measured.
 
     Attributes
     ----------
-    stamp_ns : (n,) as they were given where `samples` is 0
-    samples : median number of samples of a packet, of those with more than one; 0 where there are none
-    apart_ns : median interval between these packets
-    shared : the samples of a packet have one stamp, as a clock of whole seconds gives: it is the time of the first one
+    stamp_ns : (n,) the spread stamps [ns]; the given stamps if `samples` is 0
+    samples : median number of samples in a packet of two or more; 0 without such packets
+    apart_ns : median interval between these packets [ns]
+    shared : whether all samples of a packet have the stamp of the first sample, as with a clock of whole seconds
     """
 
     stamp_ns: Ints
@@ -39,28 +41,28 @@ class Bursts(NamedTuple):
     shared: bool = False
 
     def as_shared(self) -> Bursts:
-        """Return them with the stamps of a packet as the time of its first sample, not of its last one."""
+        """Return the bursts for stamps of the first sample of each packet, in place of the last one."""
         later = self.apart_ns - self.apart_ns // max(self.samples, 1)
         return self._replace(stamp_ns=self.stamp_ns + later, shared=True)
 
-    def sentence(self, of: str) -> str:
-        """Return what was found of samples and done, as a sentence; empty without bursts."""
+    def sentence(self, subject: str) -> str:
+        """Return a sentence about the packets of `subject` and the correction; empty without packets."""
         if not self.samples:
             return ""
         if self.shared:
-            finding = f"{of} share their stamps, {self.samples} at a time, {self.apart_ns / 1e6:.0f} ms apart"
-            return f"{finding}: the stamps are spread over the time until the next ones"
-        finding = f"{of} arrive in bursts of {self.samples}, {self.apart_ns / 1e6:.0f} ms apart"
-        return f"{finding}: the stamps of each burst are spread over the time since the one before"
+            finding = f"{subject} have the same stamp in groups of {self.samples}, {self.apart_ns / 1e6:.0f} ms apart"
+            return f"{finding}: the stamps are spread over the time until the next group"
+        finding = f"{subject} arrive in bursts of {self.samples}, {self.apart_ns / 1e6:.0f} ms apart"
+        return f"{finding}: the stamps of each burst are spread over the time since the burst before"
 
 
 def spread_bursts(stamp_ns: Ints) -> Bursts:
-    """Return stamps (n,) of samples in any order; samples of a packet are spread over the time since the last packet.
+    """Return stamps (n,) [ns] in the given order; samples of a packet are spread over the time since the last packet.
 
     Notes
     -----
-    A packet that arrives at T with N samples, after one at T', holds what was measured from T' to T: sample j of N is
-    of T' + (T - T') j / N. The last one keeps its stamp, so that distances and delays stay as they are.
+    A packet of N samples that arrives at time T, after a packet at T', was measured between T' and T: sample j of N
+    gets the stamp T' + (T - T') j / N. The last sample keeps its stamp, so that distances and delays do not change.
     """
     none = Bursts(stamp_ns, 0, 0)
     if len(stamp_ns) < 3:
@@ -88,20 +90,22 @@ def spread_bursts(stamp_ns: Ints) -> Bursts:
 
 
 EVEN_STEP = 0.5
-"""Mean step of the position within a packet, as a share of the step from packet to packet, above which the positions of
-a packet were measured one after another: it is 1 for an even rate, and 0 for repeated or truly close ones."""
+"""Mean step of the position within a packet, as a share of the mean step from packet to packet, above which the
+positions of a packet were measured one after another. The share is 1 for a steady rate, and 0 for repeated
+positions."""
 
 LARGEST_STEPS = 0.95
-"""Quantile of the steps of the position, to which larger ones are limited: jumps, and steps over gaps."""
+"""Quantile of the steps of the position to which larger steps (jumps, steps over gaps) are reduced."""
 
 
 def spread_positions(stamp_ns: Ints, place: Complexes, *, measured: bool) -> Bursts:
-    """Return stamps (n,) of positions in any order, spread where the positions move on within the packets.
+    """Return stamps (n,) [ns] of positions in the given order, spread if the position changes within the packets.
 
     Parameters
     ----------
-    place : (n,) positions in one plane [m]
-    measured : the stamps are of the measurements, not of their arrival: those that are equal were rounded down
+    place : (n,) positions in a plane as complex numbers [m]
+    measured : whether the stamps are times of measurements, which are equal if the clock rounds them down; otherwise
+        they are times of arrival
     """
     bursts = spread_bursts(stamp_ns)
     if not bursts.samples:

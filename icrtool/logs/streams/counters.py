@@ -1,4 +1,4 @@
-"""Counters and angles that begin again at a modulus: found in the numbers, and continued."""
+"""Counters and angles that begin again at a modulus: the modulus is found from the numbers, and they are continued."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ TURN_MODULI = (360.0, 2 * np.pi)
 """Moduli of angles [deg, rad]."""
 
 FEWEST_STEPS = 20
-"""Least number of steps from which a modulus is found."""
+"""Smallest number of steps between samples with which a modulus is searched."""
 
 LARGE_STEP = 0.5
-"""Least size of a step that passes the modulus, as a share of the range of the numbers."""
+"""Smallest size of a step that passes the modulus, as a share of the range of the numbers."""
 
 CONSISTENT_SHARE = 0.9
-"""Share of the large steps that must agree with one modulus."""
+"""Smallest share of the large steps that must agree with one modulus."""
 
 BETWEEN_WRAPS = 0.4
-"""Least share of its range that a counter covers between two passages of the modulus in one direction."""
+"""Smallest mean travel of a counter between two passages of the modulus, as a share of its range."""
 
 ROUND_STEPS = (1000.0, 500.0, 100.0, 360.0)
-"""Usual divisors of the moduli of counters; the first divisor that fits is taken."""
+"""Numbers of which moduli of counters are often multiples; the first number that fits is used."""
 
 
 TURN_TOLERANCE = 1e-3
-"""Relative tolerance of a turn: angles are recorded as less than a turn, or up to a rounded turn."""
+"""Relative tolerance of a turn. The largest recorded angle may be a rounded turn."""
 
 POWERS = 7, 33
-"""Range of the powers of two that are known moduli: counters of 7 to 32 bits."""
+"""Range of the exponents of powers of two that are known moduli: counters of 7 to 32 bits."""
 
 FEWEST_PASSAGES = 2
-"""Least number of passages of an unknown modulus: a single step back may be a restart of the robot."""
+"""Smallest number of passages of an unknown modulus. A single step back may be a restart of the robot."""
 
 
 class Modulus(NamedTuple):
-    """Where numbers begin again.
+    """A number at which counters or angles begin again.
 
     Attributes
     ----------
     value : the modulus, in the unit of the numbers
-    std : its standard deviation; 0 for a known modulus
+    std : standard deviation of the modulus; 0 for a known modulus
     """
 
     value: float
@@ -53,19 +53,19 @@ class Modulus(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The modulus in words."""
+        """The modulus as text, with unit and standard deviation where known."""
         words = {360.0: "360 deg", 2 * np.pi: "2 pi rad"}
         return words.get(self.value, f"{self.value:.6g}") + (f" ± {self.std:.2g}" if self.std else "")
 
 
 class _Wraps(NamedTuple):
-    """Large steps of a column.
+    """Steps of a column that may pass a modulus.
 
     Attributes
     ----------
-    moduli, spread : (w,) the modulus that each step shows, and its uncertainty
+    moduli, spread : (w,) the modulus that each step shows, and the uncertainty of this modulus
     extent : range of the column
-    between : sum over pairs of successive large steps of the travel between them, as a share of the range, at most 1
+    between : sum of the travel between successive steps, each as a share of the range, at most 1
     """
 
     moduli: Floats
@@ -75,58 +75,64 @@ class _Wraps(NamedTuple):
 
 
 def find_modulus(columns: Iterable[NDArray[Any]], given: float | None = None) -> Modulus | None:
-    """Return the modulus at which all of some counters, or angles, begin again; None where none shows.
+    """Return the common modulus at which counters or angles begin again; None where the numbers do not show one.
 
-    At a passage of the modulus a column steps by nearly all of its range, and the step minus the modulus is like the
-    steps next to it; between two passages the column runs through its range.
+    At a passage of the modulus a column steps by nearly all of its range, and the step minus the modulus is similar to
+    the steps next to it. Between two passages the column runs through its range.
 
     Parameters
     ----------
-    columns : (n,) each, of the wheels of one robot; whole numbers, or numbers that may be angles
-    given : the encoder counts of a turn, which are tried before powers of two
+    columns : one column (n,) for each wheel of a robot: whole numbers, or numbers that may be angles
+    given : encoder counts of one turn, which are tried before powers of two
     """
     arrays = [np.asarray(column) for column in columns]
-    wraps_of_columns = [wraps for column in arrays if (wraps := _wraps_of(column.astype(np.float64))) is not None]
+    wraps_of_columns = [wraps for column in arrays if (wraps := _find_wraps(column.astype(np.float64))) is not None]
     if not wraps_of_columns:
         return None
     moduli, spread = (
-        np.concatenate([one.moduli for one in wraps_of_columns]),
-        np.concatenate([one.spread for one in wraps_of_columns]),
+        np.concatenate([wraps.moduli for wraps in wraps_of_columns]),
+        np.concatenate([wraps.spread for wraps in wraps_of_columns]),
     )
     modulus = float(np.median(moduli))
     whole = all(column.dtype.kind != "f" or not np.any(np.mod(column[np.isfinite(column)], 1.0)) for column in arrays)
-    extent = max(one.extent for one in wraps_of_columns)
+    extent = max(wraps.extent for wraps in wraps_of_columns)
     margin = 2.0 * float(np.median(spread)) + (1.0 if whole else 1e-6 * modulus)
     if np.mean(np.abs(moduli - modulus) <= 2.0 * spread + margin) < CONSISTENT_SHARE:
         return None
-    count, passages = len(moduli), max(len(one.moduli) for one in wraps_of_columns)
-    if passages > 1 and sum(one.between for one in wraps_of_columns) < BETWEEN_WRAPS * sum(
-        len(one.moduli) - 1 for one in wraps_of_columns
+    count, passages = len(moduli), max(len(wraps.moduli) for wraps in wraps_of_columns)
+    if passages > 1 and sum(wraps.between for wraps in wraps_of_columns) < BETWEEN_WRAPS * sum(
+        len(wraps.moduli) - 1 for wraps in wraps_of_columns
     ):
         return None
     std = float(np.median(np.abs(moduli - modulus))) * 1.5 / np.sqrt(count) + float(np.median(spread)) / count
     lowest = extent + (1.0 if whole else 0.0)
     least, most = max(lowest, modulus - 3 * std), max(lowest + margin, modulus + 3 * std)
-    if (usual := _known_between(least, most, given, whole=whole)) is not None:
+    if (usual := _known_modulus(least, most, given, whole=whole)) is not None:
         return Modulus(usual)
     if passages < FEWEST_PASSAGES or not whole:
         return None
     rounded = (float(np.ceil(least / step) * step) for step in ROUND_STEPS)
-    found_round = next((one for one in rounded if one <= most), None)
+    found_round = next((candidate for candidate in rounded if candidate <= most), None)
     return Modulus(max(modulus, least), std) if found_round is None else Modulus(found_round)
 
 
-def _known_between(least: float, most: float, given: float | None, *, whole: bool) -> float | None:
-    """Return the first known modulus in a range: a turn, the counts of the configured encoder, a power of two."""
-    turn = next((one for one in TURN_MODULI if least <= (1 + TURN_TOLERANCE) * one and one <= most), None)
+def _known_modulus(least: float, most: float, given: float | None, *, whole: bool) -> float | None:
+    """Return the first known modulus in a range: a turn, the counts of the configured encoder, or a power of two.
+
+    None is returned where the range contains no known modulus.
+    """
+    turn = next(
+        (candidate for candidate in TURN_MODULI if least <= (1 + TURN_TOLERANCE) * candidate and candidate <= most),
+        None,
+    )
     if turn is not None or not whole:
         return turn
     counts = [*([] if given is None else [given]), *(float(1 << bits) for bits in range(*POWERS))]
-    return next((one for one in counts if least <= one <= most), None)
+    return next((candidate for candidate in counts if least <= candidate <= most), None)
 
 
-def _wraps_of(values: Floats) -> _Wraps | None:
-    """Return the large steps of a column (n,); None where no modulus can explain them."""
+def _find_wraps(values: Floats) -> _Wraps | None:
+    """Return the large steps of a column (n,); None where they cannot be passages of a modulus."""
     values = values[np.isfinite(values)]
     if len(values) < FEWEST_STEPS:
         return None
@@ -152,7 +158,7 @@ def _wraps_of(values: Floats) -> _Wraps | None:
 
 
 def unwrap_counter(values: NDArray[Any], modulus: float) -> NDArray[Any]:
-    """Return a counter (n,) without its passages of the modulus; numbers that are not finite stay in their places."""
+    """Return a counter (n,) continued beyond its modulus; numbers that are not finite stay in their places."""
     steps = np.diff(values[np.isfinite(values)]) if values.dtype.kind == "f" else np.diff(values)
     whole = values.dtype.kind != "f" and float(modulus).is_integer()
     size = int(modulus) if whole else modulus
@@ -167,10 +173,13 @@ def unwrap_counter(values: NDArray[Any], modulus: float) -> NDArray[Any]:
 
 
 def register_size(values: NDArray[Any]) -> float | None:
-    """Return the size of the counter of 16 or 32 bits that holds all whole numbers (n,); None: neither does."""
+    """Return the modulus of a counter of 16 or 32 bits whose range contains all whole numbers (n,); None beyond both.
+
+    The range may begin at 0, or be that of a signed number.
+    """
     low, high = int(values.min()), int(values.max())
     for bits in (16, 32):
         half = 1 << (bits - 1)
-        if (low >= 0 and high < 2 * half) or (low >= -half and high < half):  # without or with sign
+        if (low >= 0 and high < 2 * half) or (low >= -half and high < half):
             return float(2 * half)
     return None

@@ -1,4 +1,4 @@
-"""Messages that list the wheels as joints by name: all in one message, or each side or wheel in its own."""
+"""Reader of messages that list wheels as joints by name: all wheels in one message, or one wheel or side in each."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from numpy.typing import NDArray
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.sources import WheelSource, of_topic, stamp_rows
-from icrtool.logs.streams.wheels import MOST_WHEELS, Quantity, of_wheels, unwound_turns, wheel_joints
+from icrtool.logs.streams.sources import WheelSource, stamp_rows, topic_fields
+from icrtool.logs.streams.wheels import MOST_WHEELS, Quantity, average_wheels, unwind_turns, wheel_joints
 from icrtool.records.notes import Note, note
 from icrtool.records.text import listed
 
 
 @dataclass(frozen=True, slots=True)
 class Joints:
-    """A message type that lists joints by name, in any order; other joints may be listed in between.
+    """A message type that lists joints by name in any order, wheels and other joints.
 
     Attributes
     ----------
-    what, worth : what it is called where it is chosen, and how suitable it is
-    names, position, speed : fields of the lists
+    label : name of the data, for the reason of a choice
+    worth : score of the type; the source with the highest score is chosen
+    names, position, speed : fields with the lists of the names, positions [rad] and speeds [rad/s]
     """
 
-    what: str
+    label: str
     worth: float
     names: str
     position: str
@@ -40,7 +41,7 @@ class Joints:
         return self.names, self.position, self.speed
 
     def read(self, table: TopicTable, config: Config) -> WheelSource:
-        """Return the motion of the joints that are wheels."""
+        """Return the motion of the joints that are wheels; raise `DefinitionError` where the type lacks their names."""
         codes, texts = table.words(self.names)
         configured_names = config.wheels.left_joints, config.wheels.right_joints
         left, right = (
@@ -50,21 +51,21 @@ class Joints:
         lefts, names, problem = len(left), [texts[i] for i in left + right], ""
         if not (left and right):
             named = f"no left and right wheel among its joints {listed(texts)}"
-            problem = f"{named}; name them in wheels.{{left,right}}_joints" if texts else "lists no joints"
+            problem = f"{named}; name them in wheels.left_joints and right_joints" if texts else "lists no joints"
         elif max(lefts, len(right)) > MOST_WHEELS:
             problem = f"lists {lefts} left and {len(right)} right wheels; at most {MOST_WHEELS} of a side are read"
         if problem:
-            return WheelSource(**of_topic(table), joints=tuple(texts), problem=problem)
-        # All messages list the same joints in the same order: one row stands for them.
+            return WheelSource(**topic_fields(table), joints=tuple(texts), problem=problem)
+        # If all messages list the same joints in the same order, one row of `codes` stands for all of them.
         places, alike = _places_of(left, right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
-        why = f"{self.what}: left {listed(names[:lefts])}, right {listed(names[lefts:])}"
+        why = f"{self.label}: left {listed(names[:lefts])}, right {listed(names[lefts:])}"
         paths: dict[Quantity, str] = {"position": self.position, "speed": self.speed}
         wheels = _by_message(table, paths, places, alike) if alike.any() else _by_own_messages(table, paths, places)
         if wheels is None:
             problem = "the joints of the left and of the right were not recorded at the same time"
-            return WheelSource(**of_topic(table), joints=tuple(texts), problem=problem)
+            return WheelSource(**topic_fields(table), joints=tuple(texts), problem=problem)
         columns, source, notes = wheels
-        motion = of_wheels(
+        motion = average_wheels(
             lambda quantity: columns[quantity], lefts, names, "rad", **source, joints=tuple(texts), score=self.worth,
             why=why,
         )  # fmt: skip
@@ -72,41 +73,44 @@ class Joints:
 
 
 Columns = dict[Quantity, list[NDArray[Any]]]
-"""Positions and speeds (n,) of each wheel; no column for a quantity that is not recorded."""
+"""Positions and speeds (n,) of each wheel; an empty list for a quantity that is not recorded."""
 
 FEWEST_REPEATED = 5
-"""Least number of repeated messages between others from which a second publisher is found."""
+"""Smallest number of repeated messages between other messages with which a second publisher is found."""
 
 LITTLE_CHANGE = 0.5
-"""Largest difference of the messages before and after such a message, as a share of their difference from it."""
+"""Largest difference between the messages before and after a repeated message, as a share of their difference from the
+repeated message, with which this message comes from a second publisher."""
 
 USUAL_STEPS = 0.98
-"""Quantile of the changes from message to message that a state other than zero must exceed to be another one's."""
+"""Quantile of the changes from message to message. A repeated state that is not zero must differ by more than this
+quantile to come from a second publisher."""
 
 
 def _by_message(
     table: TopicTable, paths: Mapping[Quantity, str], places: Ints, alike: Bools
 ) -> tuple[Columns, dict[str, Any], tuple[Note, ...]]:
-    """Return the columns of messages that list both sides, what a source has of its topic, and findings."""
+    """Return the columns of messages that list both sides, the fields of a source for its topic, and findings."""
     if not alike.all():
         table, places = table.rows(alike), places[alike]
     columns: Columns = {quantity: _by_wheel(table.find(path), places) for quantity, path in paths.items()}
     foreign = _of_second_publisher(columns["position"], columns["speed"])
     if foreign is None:
-        return columns, of_topic(table), ()
+        return columns, topic_fields(table), ()
     kept = {quantity: [column[~foreign] for column in wheels] for quantity, wheels in columns.items()}
-    nothing = not np.any([np.nan_to_num(column[foreign]).any() for wheels in columns.values() for column in wheels])
-    state = "0 for every wheel" if nothing else "one and the same motion"
-    counted = f"{np.count_nonzero(foreign)} of {len(foreign)} messages state {state}, between others that do not"
-    left_out = note("second_publisher", f"{counted}: sent by a second publisher, left out")
-    return kept, of_topic(table.rows(~foreign)), (left_out,)
+    is_zero = not np.any([np.nan_to_num(column[foreign]).any() for wheels in columns.values() for column in wheels])
+    state = "0 for every wheel" if is_zero else "the same motion"
+    counted = f"{np.count_nonzero(foreign)} of {len(foreign)} messages state {state} between other motions"
+    left_out = note("second_publisher", f"{counted}: they come from a second publisher and are left out")
+    return kept, topic_fields(table.rows(~foreign)), (left_out,)
 
 
 def _of_second_publisher(positions: Sequence[NDArray[Any]], speeds: Sequence[NDArray[Any]]) -> Bools | None:
-    """Return which messages (n,) repeat one state between messages that state another motion; None: none.
+    """Return a mask of the messages (n,) of a second publisher, which repeat one state; None where there are none.
 
-    A second publisher sends zeros, or a state that it does not update. A robot that stands does not return to its
-    motion at once, and an encoder of few counts changes as little elsewhere.
+    A second publisher sends zeros, or a state that it does not update, between messages with another motion. A robot
+    that stops does not return to its motion at once. The numbers of an encoder with few counts also repeat, but they
+    change by as little in other messages.
     """
     columns = [*positions, *speeds]
     if not columns or len(columns[0]) < FEWEST_REPEATED:
@@ -127,14 +131,14 @@ def _of_second_publisher(positions: Sequence[NDArray[Any]], speeds: Sequence[NDA
         zero &= (column == 0.0) | ~finite
         known |= finite
     for repeated in (_most_repeated(sums), zero & known):
-        some = [column for column in positions if np.nan_to_num(column[~repeated]).any()] or list(speeds)
-        if _alternates(some, repeated):
+        used = [column for column in positions if np.nan_to_num(column[~repeated]).any()] or list(speeds)
+        if _alternates(used, repeated):
             return repeated
     return None
 
 
 def _most_repeated(sums: NDArray[np.float64]) -> Bools:
-    """Return which messages (n,) have the weighted sum that the largest number of stretches of equal sums has."""
+    """Return a mask of the messages (n,) with the sum that most stretches of equal sums have."""
     begins = np.append(True, sums[1:] != sums[:-1])
     values, count = np.unique(sums[begins], return_counts=True)
     return np.asarray(sums == values[int(np.argmax(count))])
@@ -142,9 +146,10 @@ def _most_repeated(sums: NDArray[np.float64]) -> Bools:
 
 @np.errstate(over="ignore", invalid="ignore")
 def _alternates(columns: Sequence[NDArray[Any]], repeated: Bools) -> bool:
-    """Return whether repeated messages (n,) lie between others that hardly differ, compared with the repeated state.
+    """Return whether repeated messages (n,) lie between messages that differ little from each other.
 
-    Differences of values near the largest number overflow; such messages do not alternate.
+    The difference is compared with the difference from the repeated state. Differences of values near the largest
+    number overflow; such messages do not alternate.
     """
     others = np.flatnonzero(~repeated)
     around = np.flatnonzero(np.diff(others) > 1)
@@ -169,20 +174,24 @@ def _alternates(columns: Sequence[NDArray[Any]], repeated: Bools) -> bool:
 def _by_own_messages(
     table: TopicTable, paths: Mapping[Quantity, str], places: Ints
 ) -> tuple[Columns, dict[str, Any], tuple[Note, ...]] | None:
-    """Return the columns of wheels that come in messages of their own, at the stamps of the first wheel.
+    """Return the columns of wheels with a message for each wheel, at the stamps of the first wheel; as `_by_message`.
 
-    Positions are interpolated, speeds held; None where the wheels were not recorded at the same time.
+    Positions are interpolated, speeds are held. None is returned if the wheels were not recorded at the same time.
     """
     rows = [np.flatnonzero(place >= 0) for place in places.T]
-    stamps = [stamp_rows(table.rows(some)) for some in rows]
-    by_header = all(one.header_ns is not None for one in stamps)
-    times = [one.on("header") if by_header else one.log_ns for one in stamps]
-    orders = [np.argsort(one, kind="stable") for one in times]
-    times = [one[order] for one, order in zip(times, orders, strict=True)]
-    half = max(int(np.median(np.diff(one))) // 2 if len(one) > 1 else 0 for one in times)
+    stamps = [stamp_rows(table.rows(rows_of_wheel)) for rows_of_wheel in rows]
+    all_have_headers = all(wheel_stamps.header_ns is not None for wheel_stamps in stamps)
+    times = [wheel_stamps.on("header") if all_have_headers else wheel_stamps.log_ns for wheel_stamps in stamps]
+    orders = [np.argsort(wheel_times, kind="stable") for wheel_times in times]
+    times = [wheel_times[order] for wheel_times, order in zip(times, orders, strict=True)]
+    half = max(int(np.median(np.diff(wheel_times))) // 2 if len(wheel_times) > 1 else 0 for wheel_times in times)
     positions = table.find(paths["position"])
-    slack = half if positions is None or not positions.shape[1] else 0  # positions are not extrapolated
-    first, last = max(one[0] for one in times) - slack, min(one[-1] for one in times) + slack
+    # Positions are not extrapolated, speeds by half an interval.
+    slack = half if positions is None or not positions.shape[1] else 0
+    first, last = (
+        max(wheel_times[0] for wheel_times in times) - slack,
+        min(wheel_times[-1] for wheel_times in times) + slack,
+    )
     both = (times[0] >= first) & (times[0] <= last)
     if not both.any():
         return None
@@ -190,31 +199,31 @@ def _by_own_messages(
     columns: Columns = {"position": [], "speed": []}
     for quantity, path in paths.items():
         values = table.find(path)
-        for wheel, (some, order) in enumerate(zip(rows, orders, strict=True)):
-            place = places[some, wheel]
+        for wheel, (rows_of_wheel, order) in enumerate(zip(rows, orders, strict=True)):
+            place = places[rows_of_wheel, wheel]
             if values is None or place.max() >= values.shape[1]:
                 columns[quantity] = []
                 break
-            stated = values[some, place].astype(np.float64)[order]
+            stated = values[rows_of_wheel, place].astype(np.float64)[order]
             if quantity == "position":
-                stated, finite = unwound_turns(stated), np.isfinite(stated)
+                stated, finite = unwind_turns(stated), np.isfinite(stated)
                 known = finite if finite.any() else ~finite
                 columns[quantity].append(np.interp(moments, times[wheel][known], stated[known]))
             else:
                 held = np.searchsorted(times[wheel], moments + half, side="right") - 1
                 columns[quantity].append(stated[np.clip(held, 0, None)])
-    source = of_topic(table.rows(rows[0][orders[0]][both]))
-    if not by_header:
+    source = topic_fields(table.rows(rows[0][orders[0]][both]))
+    if not all_have_headers:
         source["stamps"] = replace(source["stamps"], header_ns=None, note="no header of every wheel", delay_ns=0)
-    joined = note("wheels_joined", "its wheels come in messages of their own: joined by time")
+    joined = note("wheels_joined", "each of its wheels has its own messages: they are joined by time")
     return columns, source, (joined,)
 
 
 def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: int) -> tuple[Ints, Bools]:
-    """Return the place of each wheel in the list of each message (n, k), and which messages (n,) are used.
+    """Return the index of each wheel in the list of each message (n, k), and a mask of the messages (n,) to use.
 
-    A wheel that a message does not list is at -1. Messages are used if they list the most frequent set of wheels that
-    has both sides: a mean over changing wheels would jump.
+    The index is -1 for a wheel that a message does not list. Only messages with the most frequent set of wheels of both
+    sides are used, because a mean over changing wheels would jump.
     """
     wheels = [*left, *right]
     wheel = np.full(joints + 1, -1)
@@ -232,7 +241,7 @@ def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: i
 
 
 def _by_wheel(values: NDArray[Any] | None, places: Ints) -> list[Floats]:
-    """Return the values (n,) of each wheel, NaN where it is not listed; none where nothing is recorded."""
+    """Return the values (n,) of each wheel, NaN where it is not listed; an empty list if there are no values."""
     if values is None:
         return []
     columns = []
@@ -242,7 +251,7 @@ def _by_wheel(values: NDArray[Any] | None, places: Ints) -> list[Floats]:
             columns.append(values[:, place[0]])
         else:
             column = np.full(len(values), np.nan)
-            # Where one row stands for all messages, none of them has a value of this wheel.
+            # If one row of `places` stands for all messages, no message has a value of this wheel.
             if len(place) == len(column):
                 column[rows] = values[rows, place[rows]]
             columns.append(column)

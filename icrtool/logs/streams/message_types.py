@@ -1,4 +1,4 @@
-"""Every message type that is read: by role a row with its fields, units, validity and worth."""
+"""Table of all message types that are read: for each role a row with fields, units, validity and worth of the type."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX, RTK_FIX, Ro
 
 @dataclass(frozen=True, slots=True)
 class OwnRow:
-    """A row that no other kind describes, and the function that reads it."""
+    """A message type that is read by a function of its own; `fields` are the fields that it needs."""
 
     fields: tuple[str, ...]
     read: Callable[[TopicTable, Config], Source]
 
 
 MessageRow = Fix | Bearing | Orientation | Joints | FixedWheels | Twist | OwnRow
-"""What a message type carries for a role: the fields to take in addition to the header, and how they are read."""
+"""A message type in a role: the fields that it needs in addition to the header, and the method that reads them."""
 
-# Wheels: Drive.msg of jackal_msgs and of clearpath_platform_msgs has 0 for left, 1 for right.
+# Wheels: in Drive.msg of jackal_msgs and of clearpath_platform_msgs 0 is the left driver and 1 the right one.
 _JOINTS = Joints("wheel joints by name", 100.0, "name[*]", "position[*]", "velocity[*]")
 _TWO_DRIVERS = FixedWheels(
     "motor driver feedback: driver 0 left, 1 right", 90.0,
@@ -65,37 +65,40 @@ _TWIST = Twist("body twist", 50.0, fused=45.0)
 
 # Positions
 _GBAS = 2
-"""NavSatStatus: 2 is fixed or float, drivers differ. A log without such a status states nothing about the solution."""
+"""Status of NavSatStatus that drivers write for a fixed or for a float solution. If no message of a log has it, the
+status states nothing about the solution."""
 
 _GPSFIX_STATUS = {
     0: OTHER_FIX, 1: OTHER_FIX, _GBAS: RTK_FIX, 18: OTHER_FIX, 19: FIXED_FIX, 20: FLOAT_FIX, 33: OTHER_FIX,
 }  # fmt: skip
-"""GPSStatus of gps_msgs: 18 DGPS, 19 and 20 RTK, 33 WAAS."""
+"""Class of each GPSStatus of gps_msgs: 18 is DGPS, 19 RTK fixed, 20 RTK float, 33 WAAS."""
 
 _UBLOX_CARRIER = {0: OTHER_FIX, 1: FLOAT_FIX, 2: FIXED_FIX}
-"""carrSoln of u-blox."""
+"""Class of each ``carrSoln`` of u-blox."""
 
 _UBLOX_FLAGS = {carrier << 6: fix_class for carrier, fix_class in _UBLOX_CARRIER.items()}
-"""carrSoln of u-blox in bits 6 and 7 of NavPVT.flags."""
+"""Class of each ``carrSoln`` of u-blox in bits 6 and 7 of NavPVT.flags."""
 
 _NMEA_QUALITY = {1: OTHER_FIX, 2: OTHER_FIX, 3: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 8: OTHER_FIX, 9: OTHER_FIX}
-"""Quality of GGA: single, differential, PPS, RTK fixed and float, simulated, SBAS of NovAtel.
+"""Class of each quality of GGA: 1 single, 2 differential, 3 PPS, 4 RTK fixed, 5 RTK float, 8 simulated, 9 NovAtel SBAS.
 
-The others are no fixes: 0 none, 6 dead reckoning, 7 typed in.
+Other qualities are no fixes: 0 no fix, 6 dead reckoning, 7 manual input.
 """
 
 _XBOT_FLAGS = {0: OTHER_FIX, 1: OTHER_FIX, 2: FIXED_FIX, 3: FIXED_FIX, 4: FLOAT_FIX, 5: FLOAT_FIX}
-"""Low bits of the flags of xbot_msgs/AbsolutePose: 1 corrections, 2 RTK fixed, 4 RTK float."""
+"""Class by the low bits of the flags of xbot_msgs/AbsolutePose: 1 corrections, 2 RTK fixed, 4 RTK float."""
 
 _SEPTENTRIO_MODE = {1: OTHER_FIX, 2: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 6: OTHER_FIX, 7: FIXED_FIX, 8: FLOAT_FIX}
-"""Low bits of the mode: stand-alone, DGPS, RTK fixed and float, SBAS, moving-base fixed and float."""
+"""Class by the low bits of Septentrio's mode: 1 stand-alone, 2 DGPS, 4 RTK fixed, 5 RTK float, 6 SBAS, 7 fixed and 8
+float with a moving base."""
 
 _NOVATEL_TYPES = {32: FLOAT_FIX, 33: FLOAT_FIX, 34: FLOAT_FIX, 48: FIXED_FIX, 49: FIXED_FIX, 50: FIXED_FIX,
                  51: FIXED_FIX, 55: FLOAT_FIX, 56: FIXED_FIX}  # fmt: skip
-"""Position types of NovAtel, numbered as in novatel_oem7_msgs; all others have neither fixed nor float ambiguities."""
+"""Class of each position type of NovAtel, numbered as in novatel_oem7_msgs. Other types have neither fixed nor float
+ambiguities."""
 
-# Type 0 is an unknown covariance: drivers leave its numbers at 0, or write arbitrary ones. -2 is the default of ROS 2's
-# NavSatStatus; err_horz is a 95 % radius, 2.45 standard deviations.
+# Covariance type 0 means unknown: drivers leave the numbers at 0, or write arbitrary ones. Status -2 is the default of
+# ROS 2's NavSatStatus. The field err_horz is a radius of 95 %, which is 2.45 standard deviations.
 _NAVSATFIX = Fix(
     "GNSS fix", 100.0, covariance=("position_covariance[4]", "position_covariance[0]", "position_covariance[1]"),
     stated=("position_covariance_type != 0",), valid=("status.status >= 0 unless -2",),
@@ -106,15 +109,15 @@ _GPSFIX = replace(
     solution=Solution("status.status", _GPSFIX_STATUS, informative=True),
 )  # fmt: skip
 _UBLOX = Fix("u-blox position", 85.0, ("lat * 1e-7", "lon * 1e-7", "height * 1e-3"), ("hAcc|h_acc * 1e-3",))
-# low bits of a mode of 0: no solution
+# If the low bits of the mode are 0, there is no solution.
 _SEPTENTRIO = Fix(
     "Septentrio position", 85.0, ("latitude * rad", "longitude * rad", "height"), ("h_accuracy < 65535 * 0.01",),
     valid=("mode & 15 != 0", "error == 0"), solution=Solution("mode", _SEPTENTRIO_MODE, OTHER_FIX, 15),
 )  # fmt: skip
-# A height above mean sea level comes with the undulation of the geoid.
+# The height is above mean sea level; with the undulation of the geoid it is above the ellipsoid.
 _SOLVED = "SOL_COMPUTED|0"
 _INS_SOLVED = "INS_SOLUTION_GOOD|INS_SOLUTION_FREE|INS_ALIGNMENT_COMPLETE|3|6|7"
-"""What NovAtel calls a solution, in words (novatel_gps_msgs) and as numbers (novatel_oem7_msgs)."""
+"""States of NovAtel with a solution, as words (novatel_gps_msgs) and as numbers (novatel_oem7_msgs)."""
 
 _WORD_SOLUTION, _NUMBER_SOLUTION = (
     Solution(name, _NOVATEL_TYPES, OTHER_FIX) for name in ("position_type", "pos_type.type")
@@ -133,10 +136,11 @@ _METRIC_OF_POSE = replace(
     covariance=("pose.covariance[7]", "pose.covariance[0]", "pose.covariance[1]"),
 )  # fmt: skip
 _XBOT_INDEPENDENT = ("source != 100",)
-"""xbot_msgs/AbsolutePose of source 100 is fused with the wheels."""
+"""Check for poses of xbot_msgs/AbsolutePose that are not fused with the wheels; source 100 is fused."""
 
 _GST_NEAR_NS = 1_500_000_000
-"""Receivers send GST with each fix, or once a second."""
+"""Largest time between a fix and the GST sentence with its standard deviations [ns]. Receivers send GST with each fix
+or once a second."""
 
 _SENTENCE_FIX = Fix(
     "GNSS fix", 84.0, std=("north_std", "east_std"), valid=(f"quality == {'|'.join(map(str, _NMEA_QUALITY))}",),
@@ -145,19 +149,19 @@ _SENTENCE_FIX = Fix(
 
 
 def _read_fixes(table: TopicTable, config: Config) -> Source:
-    """Return the fixes of GGA, with the deviations of the nearest GST; of RMC where there is no GGA."""
-    kinds = table.column("sentence_kind").astype(np.int64)
-    kind, name = (GGA, "GGA") if (kinds & GGA).any() else (RMC, "RMC")
-    fixes, deviations = table.rows((kinds & kind) > 0), table.rows((kinds & GST) > 0)
+    """Return the fixes of GGA, or of RMC without GGA, with the standard deviations of the nearest GST."""
+    sentences = table.column("sentence_kind").astype(np.int64)
+    fix_sentence, name = (GGA, "GGA") if (sentences & GGA).any() else (RMC, "RMC")
+    fixes, deviations = table.rows((sentences & fix_sentence) > 0), table.rows((sentences & GST) > 0)
     if not len(fixes):
         raise DefinitionError(table.topic, "none of its sentences is GGA or RMC")
     if len(deviations):
         times_ns = deviations.log_time_ns
         nearest = np.searchsorted(times_ns[:-1] + np.diff(times_ns) // 2, fixes.log_time_ns)
         near = np.abs(times_ns[nearest] - fixes.log_time_ns) < _GST_NEAR_NS
-        stds = {one: np.where(near, deviations.column(one)[nearest], np.nan) for one in ("north_std", "east_std")}
+        stds = {name: np.where(near, deviations.column(name)[nearest], np.nan) for name in ("north_std", "east_std")}
         fixes = replace(fixes, columns=fixes.columns | stds)
-    return replace(_SENTENCE_FIX, what=f"{_SENTENCE_FIX.what} ({name})").read(fixes, config)
+    return replace(_SENTENCE_FIX, label=f"{_SENTENCE_FIX.label} ({name})").read(fixes, config)
 
 
 # Headings
@@ -176,7 +180,7 @@ def _read_true_headings(table: TopicTable, config: Config) -> Source:
 
 
 _AZIMUTH_ROW = OwnRow(headings.AZIMUTH_FIELDS, headings.read_azimuths)
-# ENU unless `use_ros_axis_orientation` was off, which no message states.
+# The convention is ENU unless `use_ros_axis_orientation` was off, which no message states.
 _ATTITUDE = Bearing(
     "Septentrio attitude", 88.0, valid=("error == 0", "mode != 0"), convention="enu",
     known_by="the Septentrio driver's default, use_ros_axis_orientation",
@@ -212,7 +216,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         "segway_rmp/SegwayStatus": _SEGWAY,
         "segway_rmp_ros2/SegwayStatus": _SEGWAY,
         "segway_interfaces/Segwaystatus": _SEGWAY,
-        # its motor rpm is integer, and before the gearbox
+        # The motor speed of this type is not used: it is a whole number of rpm before the gearbox.
         "scout_msgs/ScoutStatus": _AGILEX,
         "bunker_msgs/BunkerStatus": _AGILEX,
         "nav_msgs/Odometry": Odometry("twist of the wheel odometry", 60.0, "twist.twist.", fused=50.0),
@@ -228,7 +232,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         "ublox_msgs/NavPVT": replace(
             _UBLOX, valid=("flags & 1 == 1",), solution=Solution("flags", _UBLOX_FLAGS, mask=192)
         ),
-        # fix types without a place: none, dead reckoning only, time only
+        # The fix types 0 (none), 1 (dead reckoning) and 5 (time only) have no position.
         "ublox_ubx_msgs/UBXNavPVT": replace(
             _UBLOX, std=("h_acc * 1e-3",),
             valid=("gnss_fix_ok != 0", "invalid_llh != 1", "gps_fix.fix_type != 0|1|5"),
@@ -244,7 +248,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         NMEA_SENTENCE: OwnRow(("sentence",), _read_fixes),
         "septentrio_gnss_driver/PVTGeodetic": _SEPTENTRIO,
         "septentrio_gnss_driver/INSNavGeod": replace(
-            _SEPTENTRIO, what="Septentrio INS position", worth=84.0, std=("latitude_std_dev", "longitude_std_dev"),
+            _SEPTENTRIO, label="Septentrio INS position", worth=84.0, std=("latitude_std_dev", "longitude_std_dev"),
             valid=("gnss_mode & 15 != 0", "error == 0"),
             solution=Solution("gnss_mode", _SEPTENTRIO_MODE, OTHER_FIX, 15),
         ),
@@ -267,11 +271,11 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         "foxglove.PoseInFrame": _METRIC,
         "geometry_msgs/PoseWithCovarianceStamped": _METRIC_OF_POSE,
         "xbot_msgs/AbsolutePose": replace(
-            _METRIC_OF_POSE, what="GNSS position of OpenMower", worth=90.0, std=("position_accuracy",),
+            _METRIC_OF_POSE, label="GNSS position of OpenMower", worth=90.0, std=("position_accuracy",),
             valid=("flags & 8 == 0",), solution=Solution("flags", _XBOT_FLAGS, mask=7), independent=_XBOT_INDEPENDENT,
         ),
         "nav_msgs/Odometry": replace(
-            _METRIC_OF_POSE, what="metric position of an odometry message", worth=60.0, odometry=True
+            _METRIC_OF_POSE, label="metric position of an odometry message", worth=60.0, odometry=True
         ),
     },
     "heading": {
@@ -289,7 +293,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
             "orientation of an odometry message", 60.0, "pose.pose.orientation", "pose.covariance[35]", odometry=True
         ),
         "geometry_msgs/QuaternionStamped": Orientation(
-            "heading of the GNSS receiver (nmea_navsat_driver)", 80.0, "quaternion", stuffed=True
+            "heading of the GNSS receiver (nmea_navsat_driver)", 80.0, "quaternion", compass_as_yaw=True
         ),
         "foxglove.LocationFix": Bearing(
             "heading of the GNSS receiver", 88.0, "heading", variance="heading_variance",
@@ -306,7 +310,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         "ublox_msgs/NavRELPOSNED": OwnRow(headings.BASELINE_FIELDS, headings.read_baselines),
         "septentrio_gnss_driver/AttEuler": _ATTITUDE,
         "septentrio_gnss_driver/INSNavGeod": replace(
-            _ATTITUDE, what="Septentrio INS attitude", worth=89.0, std="heading_std_dev * deg", valid=("error == 0",)
+            _ATTITUDE, label="Septentrio INS attitude", worth=89.0, std="heading_std_dev * deg", valid=("error == 0",)
         ),
         "novatel_gps_msgs/NovatelDualAntennaHeading": _DUAL,
         "novatel_gps_msgs/NovatelHeading2": _DUAL,
@@ -324,8 +328,8 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         ),
     },
 }  # fmt: skip
-"""By role and type. A number is read as ``lat|latitude * 1e-7 + lat_hp * 1e-9`` states (`sources.terms_of`), a check as
-``flags & 1 == 1`` (`sources.check_of`)."""
+"""Rows by role and message type. ``lat|latitude * 1e-7 + lat_hp * 1e-9`` describes a number (`sources.terms_of`),
+``flags & 1 == 1`` a check (`sources.check_of`)."""
 
 KNOWN_TYPES = frozenset[str]().union(*MESSAGE_TYPES.values())
-"""Types with a row of their own: their fields are not searched by name."""
+"""Message types with a row in the table. The fields of other types are searched by their names."""

@@ -1,4 +1,4 @@
-"""Messages that hold the position of the antenna or of the robot: fixes, poses and transforms."""
+"""Readers of messages with the position of the antenna or of the robot: fixes, poses and transforms."""
 
 from __future__ import annotations
 
@@ -15,19 +15,29 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints, quaternion_product, turned_axis
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import FRAME_FIELD, STAMPS, TopicTable
-from icrtool.logs.streams.sources import NEVER_MOVES, PositionSource, all_valid, fields_in, number_of, of_topic
+from icrtool.logs.streams.sources import (
+    NEVER_MOVES_PENALTY,
+    PositionSource,
+    all_valid,
+    fields_in,
+    number_of,
+    topic_fields,
+)
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 from icrtool.records.text import LogText
 
 
 class Solution(NamedTuple):
-    """A field that states how a position was solved: a number, or a word of NovAtel's (``NARROW_INT``).
+    """A field that states the solution of a position: a number, or a word of NovAtel (``NARROW_INT``).
 
     Attributes
     ----------
-    codes, otherwise : the class by number, and the class of all other numbers
-    mask : the bits of the number that count
-    informative : the numbers count only if some fix has carrier phase, because drivers may write 0 for every fix
+    name : name of the field
+    codes : class of fix (`icrtool.records.samples`) of each number
+    otherwise : class of all other numbers
+    mask : bits of the number that are compared
+    informative : whether the numbers are used only if one fix has a carrier-phase solution, because drivers may write 0
+        for every fix
     """
 
     name: str
@@ -36,11 +46,11 @@ class Solution(NamedTuple):
     mask: int = -1
     informative: bool = False
 
-    def of(self, table: TopicTable) -> Bytes | None:
-        """Return the class (n,) of each fix; None where the topic states none."""
+    def classes(self, table: TopicTable) -> Bytes | None:
+        """Return the class of each fix (n,), uint8; None where the topic states none."""
         if self.name in table.texts:
             numbers, texts = table.words(self.name)
-            return np.array([*(_of_word(text) for text in texts), NOT_STATED], np.uint8)[numbers]
+            return np.array([*(_class_of_word(text) for text in texts), NOT_STATED], np.uint8)[numbers]
         values = table.integers(self.name)
         if values is None:
             return None
@@ -50,7 +60,8 @@ class Solution(NamedTuple):
         return classes if not self.informative or np.isin(classes, (FIXED_FIX, FLOAT_FIX, RTK_FIX)).any() else None
 
 
-def _of_word(text: str) -> int:
+def _class_of_word(text: str) -> int:
+    """Return the class of fix that a word of NovAtel states."""
     if not text:
         return NOT_STATED
     if text.endswith(("_FLOAT", "RTKFLOAT")):
@@ -63,17 +74,19 @@ REFERENCE_WORDS = re.compile(
     r"prism|leica|utm|global|navsat|\bins\b|vectornav|novatel|sbg|ublox",
     re.IGNORECASE,
 )
-"""Words in names of odometry and pose topics, or of their frames, that show a reference, not the robot's own dead
-reckoning."""
+"""Words in names of odometry and pose topics, or of their frames, that show a position reference and not the dead
+reckoning of the robot."""
 
 REFERENCE_FRAMES = {"world", "earth", "ecef", "local_enu", "enu", "camera_init"}
-"""Further names of frames of a reference; FAST-LIO and LOAM call their map ``camera_init``."""
+"""Other names of frames of a position reference. FAST-LIO and LOAM call their map ``camera_init``."""
 
 GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
-GOAL = "its name is the name of a goal, not of a measurement"
+"""Words in names of topics that hold goals or commands."""
+
+GOAL_PROBLEM = "its name is the name of a goal, not of a measurement"
 
 LEAST_DRIVE_WIDTH_M = 1.0
-"""Least width of a drive that shows in which plane it lies: a standard deviation of its positions [m]."""
+"""Smallest width of a drive with which the plane of the drive is found, as a standard deviation of positions [m]."""
 
 FLAT_RATIO = 0.1
 """Largest ratio of thickness to width of the plane of a drive."""
@@ -82,33 +95,34 @@ LARGEST_PLACE_M = 1e8
 """Largest coordinate that is used [m]."""
 
 MOST_PLACES = 2000
-"""Largest number of positions that the plane of a drive is computed from."""
+"""Largest number of positions from which the plane of a drive is computed."""
 
 LEAST_RADIUS_M = 6.33e6
-"""Least distance of a place on earth from the centre [m]. UTM coordinates may reach it, but have a height near 0."""
+"""Smallest distance of a place on earth from the centre of the earth [m]."""
 
 LARGEST_RADIUS_M = 6.40e6
-"""Largest distance of a place on earth from the centre [m]."""
+"""Largest distance of a place on earth from the centre of the earth [m]."""
 
 NO_SOLUTION = Solution("", {})
 
 HIGHEST_M = 20_000.0
-"""Largest height [m]; a larger height means "unknown", and is replaced by the median of the others."""
+"""Largest height that is used [m]. A larger height stands for "unknown", and is replaced by the median of the other
+heights."""
 
 FARTHEST_M = 200_000.0
-"""Largest distance of a robot from the middle of its fixes [m]."""
+"""Largest distance of a fix from the median of all fixes [m]."""
 
 STILL_M = 0.5
-"""Largest range of the fixes of a receiver that never moves [m], on a base station or a standing robot."""
+"""Largest range of the fixes of a receiver that never moves, as on a base station [m]."""
 
 METRES_PER_DEGREE = 111_000.0
 """Length of a degree of latitude [m]."""
 
 GOOD_STD_M = 0.3
-"""Largest standard deviation of a preferred fix [m], which is RTK or nearly so."""
+"""Largest median standard deviation of preferred fixes [m]. RTK fixes have a smaller one."""
 
-NOT_GOOD = 35.0
-"""Subtracted from the worth of fixes that are not preferred."""
+INACCURATE_PENALTY = 35.0
+"""Number that is subtracted from the worth of fixes with a larger standard deviation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,19 +131,22 @@ class Fix:
 
     Attributes
     ----------
-    what, worth : what it is called where it is chosen, and how suitable it is as reference
-    place : latitude and longitude [deg], height above the ellipsoid [m]; where `metric` x, y, z [m]
-    std : standard deviation [m] to the north and to the east; one text for both. All are read by `number_of`
-    covariance : the variances to the north and to the east and their covariance, which have precedence
-    stated : checks, all of which a stated covariance must pass
-    valid : checks, all of which a fix must pass
-    solution : how it was solved
-    metric : x is taken as east and y as north, in the topic's own frame
-    odometry : its name or frame must show that it is a reference
-    independent : checks of an independent position; if half of the messages fail, it is fused with the wheels
+    label : name of the data, for the reason of a choice
+    worth : score of the type; the source with the highest score is chosen
+    place : numbers for `number_of`: latitude and longitude [deg], height above the ellipsoid [m]; if `metric`, x, y, z
+        [m]
+    std : numbers of the standard deviations to the north and to the east [m], or one number for both
+    covariance : numbers of the variances to the north and to the east and of their covariance [m^2]; they are preferred
+        to `std`
+    stated : checks that a stated covariance passes
+    valid : checks that a valid fix passes
+    solution : field with the solution of the position
+    metric : whether the positions are metric: x to the east and y to the north in the frame of the topic
+    odometry : whether the type is an odometry, whose name or frame must show that it is a position reference
+    independent : checks that an independent position passes; if half of the messages fail, it is fused with the wheels
     """
 
-    what: str
+    label: str
     worth: float
     place: tuple[str, str, str] = ("latitude", "longitude", "altitude")
     std: tuple[str, ...] = ()
@@ -148,13 +165,18 @@ class Fix:
         return fields_in(numbers, (*self.valid, *self.stated, *self.independent))
 
     def read(self, table: TopicTable, config: Config) -> PositionSource:
-        """Return its positions; usable ones are finite and have a fix.
+        """Return the positions of a topic.
 
-        Usable geodetic positions also lie on earth, not at 0, 0, and near the others.
+        A usable position is finite and has a fix. A usable geodetic position also lies on earth, not at latitude and
+        longitude 0, and near the other positions. Metric positions have a problem if they are goals, dead reckoning, or
+        in a frame whose z axis does not point up.
 
-        Metric positions of goals, of dead reckoning and of frames whose z is not up are refused.
+        Raises
+        ------
+        DefinitionError
+            The type, as the log defines it, lacks the position.
         """
-        first, second = (number_of(table, one, needed=True) for one in self.place[:2])
+        first, second = (number_of(table, coordinate, needed=True) for coordinate in self.place[:2])
         third = number_of(table, self.place[2])
         status_counts = config.topics.gnss_status == "stated"
         no_fix, finite = ~all_valid(table, self.valid) & status_counts, np.isfinite(first) & np.isfinite(second)
@@ -180,7 +202,7 @@ class Fix:
         geodetic = metric = None
         if self.metric:
             metric = np.column_stack([second, first])
-            score, why, problem = self.worth, self.what, self._problem(table, places[usable])
+            score, why, problem = self.worth, self.label, self._problem(table, places[usable])
         else:
             plausible = np.abs(third) < HIGHEST_M
             known = third[plausible & usable]
@@ -191,14 +213,14 @@ class Fix:
             problem = "" if usable.any() else f"no usable fix ({counts})"
             problem += "; they state an accuracy: topics.gnss_status=ignored uses them" if silenced else ""
         return PositionSource(
-            **of_topic(table), geodetic=geodetic, metric=metric, variance=variance, usable=usable, rejected=rejected,
-            score=score, why=why, problem=problem, stated_class=self.solution.of(table),
+            **topic_fields(table), geodetic=geodetic, metric=metric, variance=variance, usable=usable,
+            rejected=rejected, score=score, why=why, problem=problem, stated_class=self.solution.classes(table),
         )  # fmt: skip
 
     def _variance(self, table: TopicTable) -> Floats:
-        """Return north, east, covariance of both [m^2] (n, 3), NaN where not stated.
+        """Return the variances to the north and east and their covariance (n, 3) [m^2], NaN where not stated.
 
-        A covariance of axes that are not both positive states nothing.
+        Variances that are not both positive count as not stated.
         """
         variance = np.full((len(table), 3), np.nan)
         if self.std:
@@ -207,23 +229,24 @@ class Fix:
             with np.errstate(over="ignore"):
                 variance[has_variance] = np.column_stack([north**2, east**2, np.zeros(len(table))])[has_variance]
         if self.covariance:
-            diagonal = np.column_stack([number_of(table, one) for one in self.covariance])
+            diagonal = np.column_stack([number_of(table, entry) for entry in self.covariance])
             has_variance = (diagonal[:, 0] > 0) & (diagonal[:, 1] > 0) & all_valid(table, self.stated)
             variance[has_variance] = diagonal[has_variance]
         return variance
 
     def _worth(self, places_deg: Floats, variance: Floats) -> tuple[float, str]:
-        """Return how suitable fixes (n, 2) are, and why: less where they are not accurate, or never move."""
+        """Return the score of fixes (n, 2) [deg], lower if they are inaccurate or never move, and the reason."""
         std = float(np.sqrt(np.nanmedian(variance))) if np.isfinite(variance).any() else math.nan
-        what, score = self.what, self.worth - (NOT_GOOD if std > GOOD_STD_M else 0.0)
+        label, score = self.label, self.worth - (INACCURATE_PENALTY if std > GOOD_STD_M else 0.0)
         if len(places_deg) > 1:
             spread = np.ptp(np.percentile(places_deg, [2.5, 97.5], axis=0), axis=0)
-            if (spread * METRES_PER_DEGREE < STILL_M).all():  # whatever the latitude
-                what, score = f"{what} that never moves", score - NEVER_MOVES
-        return score, f"{what}, states ±{std:.2g} m" if math.isfinite(std) else f"{what}, states no accuracy"
+            # A degree of longitude is shorter than a degree of latitude, so that the test is strict for both.
+            if (spread * METRES_PER_DEGREE < STILL_M).all():
+                label, score = f"{label} that never moves", score - NEVER_MOVES_PENALTY
+        return score, f"{label}, states ±{std:.2g} m" if math.isfinite(std) else f"{label}, states no accuracy"
 
     def _problem(self, table: TopicTable, places: Floats) -> str:
-        """Return why positions x, y, z (n, 3) are no reference, empty where they may be one."""
+        """Return the reason why positions x, y, z (n, 3) [m] are no reference; empty where they may be one."""
         frame = table.text(FRAME_FIELD).lstrip("/")
         is_reference = REFERENCE_WORDS.search(f"{table.topic} {frame}") or frame in REFERENCE_FRAMES
         problem = ""
@@ -236,7 +259,7 @@ class Fix:
         elif not _is_level(places):
             problem = "its positions lie in a plane that stands upright: z is not up, as in a camera's optical frame"
         elif GOAL_WORDS.search(table.topic):
-            problem = GOAL
+            problem = GOAL_PROBLEM
         elif not is_reference and (self.odometry or "odom" in table.topic.lower()):
             problem = (
                 "its name and frame do not show a position reference: it may be the wheels' dead reckoning; "
@@ -246,11 +269,15 @@ class Fix:
 
 
 def _far_away(latitude_deg: Floats, longitude_deg: Floats, known: Bools) -> Bools:
-    """Return which known fixes (n,) lie far from the others: a receiver may send its last place when switched on."""
+    """Return a mask of the known fixes (n,) that are far from the others.
+
+    A receiver that is switched on may first send the last position of an earlier drive.
+    """
     far, latitude_deg, longitude_deg = np.zeros(len(known), np.bool_), latitude_deg[known], longitude_deg[known]
     if len(latitude_deg):
         middle_deg = float(np.median(latitude_deg))
-        east_deg = np.mod(longitude_deg - longitude_deg[0] + 180.0, 360.0) - 180.0  # no step at the date line
+        # Relative to the first fix, longitudes have no step at the date line.
+        east_deg = np.mod(longitude_deg - longitude_deg[0] + 180.0, 360.0) - 180.0
         east_deg = (east_deg - np.median(east_deg)) * math.cos(math.radians(middle_deg))
         away_deg = np.maximum(np.abs(latitude_deg - middle_deg), np.abs(east_deg))
         far[known] = away_deg * METRES_PER_DEGREE > FARTHEST_M
@@ -258,29 +285,29 @@ def _far_away(latitude_deg: Floats, longitude_deg: Floats, known: Bools) -> Bool
 
 
 def is_fused(table: TopicTable, independent: tuple[str, ...]) -> bool:
-    """Return whether half of the messages or more do not pass the checks of independent ones."""
+    """Return whether half of the messages or more do not pass the checks `independent`."""
     return 2 * int(np.count_nonzero(all_valid(table, independent))) <= len(table)
 
 
 def _is_level(places_m: Floats) -> bool:
-    """Return whether a drive (n, 3) that has an area lies in a plane whose normal is within 45 deg of z."""
-    some = places_m[:: max(1, len(places_m) // MOST_PLACES)]
-    if len(some) < 3 or not (np.abs(some) < LARGEST_PLACE_M).all():
+    """Return whether the plane of a drive (n, 3) has a normal within 45 deg of z; True where the plane is not shown."""
+    sample = places_m[:: max(1, len(places_m) // MOST_PLACES)]
+    if len(sample) < 3 or not (np.abs(sample) < LARGEST_PLACE_M).all():
         return True
-    # single jumps do not widen the drive
-    kept = np.clip(some, *np.percentile(some, [2.5, 97.5], axis=0))
+    # Coordinates are clipped so that single outliers do not widen the drive.
+    kept = np.clip(sample, *np.percentile(sample, [2.5, 97.5], axis=0))
     _, size, axes = np.linalg.svd(kept - kept.mean(axis=0), full_matrices=False)
-    _, across_m, off_m = size / math.sqrt(len(some))
+    _, across_m, off_m = size / math.sqrt(len(sample))
     return bool(across_m < LEAST_DRIVE_WIDTH_M or off_m > FLAT_RATIO * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
 
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 BASE_FRAMES = ("base_link", "base_footprint", "chassis_link", "base")
 LARGEST_LEVER_ARM_M = 5.0
-"""Largest distance of an antenna from the body origin [m]; a longer transform is ignored."""
+"""Largest distance of an antenna from the body origin [m]. A longer transform is ignored."""
 
 LARGEST_TRANSLATION_M = 1e9
-"""Largest translation of a transform [m]; a larger one is damaged. UTM coordinates reach 1e7."""
+"""Largest translation of a transform [m]. A larger one is damaged; UTM coordinates are below 1e7."""
 
 _PREFIX = "transforms[*]."
 TRANSFORM_FIELDS = (
@@ -289,39 +316,43 @@ TRANSFORM_FIELDS = (
     *(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz"),
     *(f"{_PREFIX}transform.rotation.{axis}" for axis in "xyzw"),
 )
-"""Fields of a transform: parent, child, translation, rotation."""
+"""Fields of a transform: name of the parent frame, name of the child frame, translation [m], rotation."""
 
 TRANSFORM_STAMP = tuple(f"{_PREFIX}header.stamp.{part}" for part in ("sec", "nanosec"))
 _POSE = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw"))
 
 Transforms = dict[str, tuple[str, Floats, Floats]]
-"""Child frame to parent frame, and origin (3,) [m] and axes (3, 3) of the child in it."""
+"""For each child frame its parent frame, and the origin (3,) [m] and the axes (3, 3) of the child in the parent."""
 
 
 def is_static(channel: Channel) -> bool:
-    """Return whether a channel carries static transforms."""
+    """Return whether a channel has static transforms."""
     return channel.message_type in TRANSFORM_TYPES and channel.topic.rstrip("/").endswith("tf_static")
 
 
 def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[float, float] | None:
-    """Return the antenna's position in the body frame, forward and right [m]; None where the log has no transform.
+    """Return the antenna's position in the body frame, forward and right [m]; None where the log does not state it.
 
     Parameters
     ----------
-    antenna_topic : topic of the fixes; its header names the antenna's frame
+    tables : tables of the log, with its transforms
+    antenna_topic : topic of the fixes; its header names the frame of the antenna
     """
     frame = next((table.text(FRAME_FIELD).strip("/") for table in tables if table.topic == antenna_topic), "")
     links: dict[str, _Link] = {}
     for table in tables:
         if table.message_type in TRANSFORM_TYPES and all(path in table.columns for path in TRANSFORM_FIELDS):
-            links |= _links(table)
+            links |= _read_links(table)
     if not frame or frame not in links:
         return None
-    # of several messages for one child frame, the last
-    turns = np.array([one.turn[-1] for one in links.values()]).T
+    # The last message for a child frame is used.
+    turns = np.array([link.turn[-1] for link in links.values()]).T
     axes = np.array([turned_axis(axis, *turns) for axis in range(3)]).transpose(2, 0, 1)
-    placed = _in_roots(
-        {name: (one.parent, one.place[-1], of) for (name, one), of in zip(links.items(), axes, strict=True)}
+    placed = _place_in_roots(
+        {
+            name: (link.parent, link.place[-1], frame_axes)
+            for (name, link), frame_axes in zip(links.items(), axes, strict=True)
+        }
     )
     root, place, _ = placed[frame]
     for base in (name for last in BASE_FRAMES for name in sorted(placed) if name.rsplit("/", 1)[-1] == last):
@@ -333,8 +364,11 @@ def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[flo
     return None
 
 
-def _in_roots(transforms: Transforms) -> Transforms:
-    """Return each frame's root, and the frame's origin and axes in this root; a frame in a circle is its own root."""
+def _place_in_roots(transforms: Transforms) -> Transforms:
+    """Return the root of each frame, and the origin and axes of the frame in this root.
+
+    Each frame of a circle is its own root.
+    """
     placed: Transforms = {}
     for name in transforms:
         chain: dict[str, None] = {}
@@ -345,18 +379,26 @@ def _in_roots(transforms: Transforms) -> Transforms:
         below = list(chain)
         if frame in chain:
             circle = below.index(frame)
-            placed |= {one: (one, np.zeros(3), np.eye(3)) for one in below[circle:]}
+            placed |= {frame: (frame, np.zeros(3), np.eye(3)) for frame in below[circle:]}
             del below[circle:]
         root, origin, axes = placed.setdefault(frame, (frame, np.zeros(3), np.eye(3)))
-        for one in reversed(below):
-            _, translation, turn = transforms[one]
+        for child in reversed(below):
+            _, translation, turn = transforms[child]
             origin, axes = translation @ axes + origin, turn @ axes
-            placed[one] = (root, origin, axes)
+            placed[child] = (root, origin, axes)
     return placed
 
 
 class _Link(NamedTuple):
-    """A frame in its parent: the messages (n,) and places in them (n,), translations (n, 3), quaternions (n, 4)."""
+    """Transforms of one child frame.
+
+    Attributes
+    ----------
+    parent : name of the parent frame
+    rows, places : (n,) message of each transform, and its index in the message
+    place : (n, 3) origin of the child in the parent [m]
+    turn : (n, 4) quaternion x, y, z, w of the child in the parent
+    """
 
     parent: LogText
     rows: Ints
@@ -368,13 +410,14 @@ class _Link(NamedTuple):
 def transform_pose(table: TopicTable) -> TopicTable:
     """Return the poses of the robot's base in the root of the transforms, as messages of PoseStamped.
 
-    Where an odometry frame lies between base and root, the root moves against it in steps, as a map does after each
-    matched scan. There is one pose, at the first odometry after each step: later poses add only the odometry's motion.
+    If an odometry frame lies between base and root, the root moves in steps with respect to it, as a map does after
+    each matched scan. Only the first pose after each step is returned, because later poses add the motion of the
+    odometry alone.
 
     Raises
     ------
     DefinitionError
-        No base frame moves, or the root is no reference.
+        No base frame moves, or the root is no position reference.
     """
     base = _base_in_root(table)
     step = base.step
@@ -382,7 +425,7 @@ def transform_pose(table: TopicTable) -> TopicTable:
         why = f"its root, {base.root}, does not show a position reference: it may be the wheels' dead reckoning"
         raise DefinitionError(table.topic, why)
     if not step.any():
-        why = f"its {base.root} never moves against the odometry: that is dead reckoning"
+        why = f"its frame {base.root} never moves with respect to the odometry: its poses are dead reckoning"
         raise DefinitionError(table.topic, why)
     return base.table_of(table, step)
 
@@ -400,10 +443,16 @@ def every_transform_pose(table: TopicTable) -> TopicTable:
 
 
 class _BasePoses(NamedTuple):
-    """Poses of the base in the root of the transforms: messages (n,) and places in them (n,), position, quaternion.
+    """Poses of the robot's base in the root of the transforms.
 
-    `step` (n,) marks the poses after the root moved with respect to an odometry; all poses where the base is the root's
-    own child.
+    Attributes
+    ----------
+    root : name of the root frame
+    rows, places : (n,) message of each pose, and the index of its transform in the message
+    place : (n, 3) position [m]
+    turn : (n, 4) quaternion x, y, z, w
+    step : (n,) mask of the first pose after each step of the root with respect to an odometry; if the base is a child
+        of the root, of all poses
     """
 
     root: LogText
@@ -413,30 +462,30 @@ class _BasePoses(NamedTuple):
     turn: Floats
     step: Bools
 
-    def table_of(self, table: TopicTable, some: Bools) -> TopicTable:
-        """Return some of the poses (n,) as messages of PoseStamped."""
-        stamps = (table.column(path)[self.rows[some], self.places[some]] for path in TRANSFORM_STAMP)
-        frame = np.zeros(np.count_nonzero(some), np.int64)
-        values = [*stamps, frame, *self.place[some].T, *self.turn[some].T]
+    def table_of(self, table: TopicTable, chosen: Bools) -> TopicTable:
+        """Return the poses that a mask (n,) chooses as messages of PoseStamped; `table` holds the transforms."""
+        stamps = (table.column(path)[self.rows[chosen], self.places[chosen]] for path in TRANSFORM_STAMP)
+        frame = np.zeros(np.count_nonzero(chosen), np.int64)
+        values = [*stamps, frame, *self.place[chosen].T, *self.turn[chosen].T]
         columns = dict(zip((*STAMPS[0], FRAME_FIELD, *_POSE), values, strict=True))
         return replace(
-            table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[self.rows[some]],
+            table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[self.rows[chosen]],
             columns=columns, texts={FRAME_FIELD: [self.root]},
         )  # fmt: skip
 
 
 def _base_in_root(table: TopicTable) -> _BasePoses:
-    """Return the poses of the base, through every frame between it and the root.
+    """Return the poses of the base in the root, computed through all frames between base and root.
 
     Raises
     ------
     DefinitionError
         No base frame moves.
     """
-    links = _links(table)
-    base = next((one for last in BASE_FRAMES for one in links if one.rsplit("/", 1)[-1] == last), None)
+    links = _read_links(table)
+    base = next((name for last in BASE_FRAMES for name in links if name.rsplit("/", 1)[-1] == last), None)
     if base is None:
-        raise DefinitionError(table.topic, f"it moves none of the frames {', '.join(BASE_FRAMES)}")
+        raise DefinitionError(table.topic, f"it has no transform of a frame {', '.join(BASE_FRAMES)}")
     root, rows, places, place, turn = links.pop(base)
     step = np.zeros(len(rows), np.bool_)
     lowest = True
@@ -456,13 +505,14 @@ def _base_in_root(table: TopicTable) -> _BasePoses:
     return _BasePoses(root, rows, places, place, turn, step | lowest)
 
 
-def _links(table: TopicTable) -> dict[str, _Link]:
-    """Return the frames that a topic holds by name, without their leading slash."""
+def _read_links(table: TopicTable) -> dict[str, _Link]:
+    """Return the transforms of each child frame of a topic, by its name without a leading slash."""
     parents, parent_names = table.words(TRANSFORM_FIELDS[0])
     children, child_names = table.words(TRANSFORM_FIELDS[1])
     numbers = np.stack([table.column(path) for path in TRANSFORM_FIELDS[2:]], axis=-1)
     length, size = (np.abs(part).max(axis=-1) for part in (numbers[..., :3], numbers[..., 3:]))
-    sound = (length < LARGEST_TRANSLATION_M) & (size > 0.01) & (size < 100.0)  # a unit quaternion, or nearly
+    # The largest component of a unit quaternion is between 0.5 and 1; the limits allow for one that is not normalised.
+    sound = (length < LARGEST_TRANSLATION_M) & (size > 0.01) & (size < 100.0)
     all_rows, all_places = np.nonzero((children >= 0) & sound)
     order = np.argsort(children[all_rows, all_places], kind="stable")
     ends = np.cumsum(np.bincount(children[all_rows, all_places], minlength=len(child_names)))

@@ -1,4 +1,4 @@
-"""Choose the topic for each role: wheels, position and heading; each candidate with its reasons."""
+"""Choice of the topics for wheels, position and heading among candidates, with the reason for each choice."""
 
 from __future__ import annotations
 
@@ -20,48 +20,60 @@ from icrtool.logs.streams.positions import (
     TRANSFORM_TYPES,
     is_static,
 )
-from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelSource, of_topic
+from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelSource, topic_fields
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
 from icrtool.records.notes import Note, note
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean, listed
 
-Kind = TypeVar("Kind", WheelSource, PositionSource, HeadingSource)
+SourceType = TypeVar("SourceType", WheelSource, PositionSource, HeadingSource)
 
 NEEDS: dict[Role, str] = {
-    "wheels": "wheel joints, encoders, motor feedback, wheel odometry or a twist; of messages of other types "
-    "topics.wheel_left and wheel_right name the fields (/topic.field), of a body twist twist_speed and twist_turn",
+    "wheels": "wheel joints, encoders, motor feedback, wheel odometry or a twist; for other message types, name the "
+    "fields (/topic.field) in topics.wheel_left and wheel_right, or a body twist in topics.twist_speed and twist_turn",
     "gnss": "a GNSS fix, or a pose of a reference (total station, lidar, motion capture)",
     "heading": "an orientation (AHRS), a compass or a dual antenna heading",
 }
 
-SAME_NAMESPACE = 8.0
-"""Added to the score of a candidate in the namespace of the wheels, which belongs to the same robot."""
+"""Data that each role needs, for messages."""
 
-COMPLETE = 5.0
-"""Added for each other role that the wheels' namespace can fill: of two robots, the one with all sensors is chosen."""
+NAMESPACE_BONUS = 8.0
+"""Number that is added to the score of a candidate in the namespace of the wheels, which shows the same robot."""
 
-WORTHY = 40.0
-"""Least score of measured wheels; topics below are commands or velocities of other sensors."""
+ROLE_BONUS = 5.0
+"""Number that is added to the score of wheels for each other role that their namespace can fill. Of two robots, the one
+with all sensors is then chosen."""
 
-SAME_MESSAGE = 100.0
-"""Added to the score of the heading of the metric pose that gives the position: both share a frame, and another heading
-does not fit a local map."""
+LEAST_MEASURED_SCORE = 40.0
+"""Smallest score of measured wheels. Topics with a smaller score hold commands or velocities of other sensors."""
+
+POSE_HEADING_BONUS = 100.0
+"""Number that is added to the score of a heading from the same topic as a metric position. Both have one frame; another
+heading does not fit a local map."""
 
 NO_SCHEMA = "no schema"
-"""Stands for the message type of a channel that states none."""
+"""Text in place of the message type of a channel without one."""
 
 MOST_LISTED_TOPICS = 40
+"""Largest number of topics that an error lists."""
+
 MOST_REFERENCES = 3
+"""Largest number of other position references that are compared with the chosen one."""
 
 FUSED_WORDS = re.compile(r"ekf|ukf|fused|filtered|localization|global", re.IGNORECASE)
-"""Words in names of poses that another filter made, usually with the wheels: agreement with the wheels shows
-nothing."""
+"""Words in names of poses of another filter. Such a filter usually uses the wheels, so that agreement with the wheels
+shows nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """All sources found, best first by role; `unread`: why other topics of known types cannot be sources."""
+    """The sources that were found.
+
+    Attributes
+    ----------
+    wheels, gnss, heading : sources for each role, the best one first
+    unread : for each other topic of a known type the reason why it is no source
+    """
 
     wheels: tuple[WheelSource, ...]
     gnss: tuple[PositionSource, ...]
@@ -75,25 +87,25 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The source of each role, with the reason for the choice; `heading` is None where no topic holds one."""
+    """The chosen source of each role, with the reason in its `why`; `heading` is None where no topic holds one."""
 
     wheels: WheelSource
     gnss: PositionSource
     heading: HeadingSource | None
 
 
-def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tuple[str, ...]]:
-    """Return, by channel id, the fields that some role may need; other channels are absent.
+def wanted_fields(channels: Sequence[Channel], config: Config) -> dict[int, tuple[str, ...]]:
+    """Return the paths of the fields to read, by channel id; channels that no role needs are absent.
 
-    Moving transforms are taken where no topic can be the position: reading them takes longer than the rest of a log. An
-    odometry that is no reference by name does not count.
+    Moving transforms take longer to read than the rest of a log. They are read only if no other topic can be the
+    position; an odometry whose name shows no position reference does not count as one.
     """
     topics, wanted, static, moving = config.topics, {}, {}, {}
     sides = side_fields(channels, topics)
     has_position = any(
-        one.message_type in MESSAGE_TYPES["gnss"]
-        and (one.message_type != "nav_msgs/Odometry" or REFERENCE_WORDS.search(one.topic) is not None)
-        for one in channels
+        channel.message_type in MESSAGE_TYPES["gnss"]
+        and (channel.message_type != "nav_msgs/Odometry" or REFERENCE_WORDS.search(channel.topic) is not None)
+        for channel in channels
     )
     for channel in channels:
         paths = sorted(sides[channel.id])
@@ -113,17 +125,22 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
             topics.gnss == channel.topic or not (has_position or topics.gnss)
         ):
             moving[channel.id] = (*TRANSFORM_FIELDS, *TRANSFORM_STAMP)
-    # if a frame is in both, the moving transform counts
+    # For a channel that is in several dicts, the fields of the last one are used.
     return wanted | static | moving
 
 
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
-    """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace.
+    """Return all topics as sources for the roles that they may have, ranked by type, content and namespace.
 
-    Columns from which only candidates are made are removed: for topics that can only be wheels, before others are read.
+    Columns that are no longer needed are removed from the tables. For topics that can only be wheels this is done
+    before the other topics are read.
+
+    Parameters
+    ----------
+    unread : reason why a topic was not decoded, by topic
     """
     topics = config.topics
-    # the wheels first: their memory, the largest, is then free for the others
+    # The wheels come first, because they have the largest columns, which are then removed.
     wheels = pair_candidates(tables, config)
     if not topics.fields_of_wheels:
         wheels = _read_all(tables, "wheels", config, WheelSource) + wheels
@@ -132,22 +149,22 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
     gnss = _read_all(tables, "gnss", config, PositionSource)
     heading = _read_all(tables, "heading", config, HeadingSource)
     filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
-    complete = {name: COMPLETE * sum(name in names for names in filled) for name in set().union(*filled)}
-    wheels = _ranked(wheels, topics.wheels, complete)
-    near = {_namespace(wheels[0].topic): SAME_NAMESPACE} if wheels else {}
+    complete = {name: ROLE_BONUS * sum(name in names for names in filled) for name in set().union(*filled)}
+    wheels = _rank_sources(wheels, topics.wheels, complete)
+    near = {_namespace(wheels[0].topic): NAMESPACE_BONUS} if wheels else {}
     others = _other_robots(wheels)
-    # The position of the message whose twist is used for the wheels is refused, where it is not configured.
+    # The position in the messages whose twist is used for the wheels is refused, unless it is configured.
     own = wheels[0].topic if wheels and not wheels[0].problem and wheels[0].twist is not None else None
     dependent = "its twist is used for the wheels; a reference must be independent of them"
     gnss = [
-        replace(one, problem=one.problem or dependent) if one.topic == own and topics.gnss != own else one
-        for one in gnss
+        replace(source, problem=source.problem or dependent) if source.topic == own and topics.gnss != own else source
+        for source in gnss
     ]
-    gnss = _ranked(gnss, topics.gnss, near, others)
+    gnss = _rank_sources(gnss, topics.gnss, near, others)
     best = gnss[0] if gnss and not gnss[0].problem else None
     metric = best.topic if best is not None and best.metric is not None else ""
     others -= {_namespace(metric)} if metric else set()
-    heading = _ranked(heading, topics.heading, near, others, metric)
+    heading = _rank_sources(heading, topics.heading, near, others, metric)
     lost = "none of its {} messages fits its message type"
     empty: dict[str, str] = {
         table.topic: lost.format(table.unreadable) if table.unreadable else "no message"
@@ -159,84 +176,97 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
 
 
 def drop_used_columns(tables: Sequence[TopicTable]) -> None:
-    """Remove the columns from which only candidates were made: half of the memory of a log."""
+    """Remove the columns that only candidates are made from, which take half of the memory of a log."""
     for table in tables:
         for name in table.columns.keys() - {*HEADER, *GYRO_AXES, *TRANSFORM_FIELDS}:
             del table.columns[name]
 
 
-def _read_all(tables: Sequence[TopicTable], role: Role, config: Config, kind: type[Kind]) -> list[Kind]:
-    """Return the topics of one role as sources; a topic whose type lacks a needed field in this log is not usable."""
+def _read_all(
+    tables: Sequence[TopicTable], role: Role, config: Config, source_class: type[SourceType]
+) -> list[SourceType]:
+    """Return the topics of a role as sources; a topic whose type lacks a needed field gets a `problem`."""
     sources = []
     for table in tables:
         row = MESSAGE_TYPES[role].get(table.message_type)
         if row is not None and getattr(config.topics, role) in (None, table.topic) and len(table):
             try:
-                sources.append(cast("Kind", row.read(table, config)))
+                sources.append(cast("SourceType", row.read(table, config)))
             except DefinitionError as err:
-                sources.append(kind(**of_topic(table), problem=err.why))
+                sources.append(source_class(**topic_fields(table), problem=err.why))
     return sources
 
 
-def _ranked(
-    sources: Sequence[Kind],
+def _rank_sources(
+    sources: Sequence[SourceType],
     configured: str | None,
     bonus: Mapping[str, float],
     others: frozenset[str] = frozenset(),
-    same: str = "",
-) -> list[Kind]:
-    """Return the sources sorted: usable ones first, this robot's before other robots', then by score and bonus.
+    pose_topic: str = "",
+) -> list[SourceType]:
+    """Return the sources sorted: usable ones first, sources of this robot before other robots, then by score.
 
     Parameters
     ----------
-    bonus, others : what is added to a score, by namespace; namespaces of other robots
-    same : the topic of a metric pose, whose heading is preferred
+    configured : configured topic of the role, which counts as usable
+    bonus : number that is added to the score, by namespace
+    others : namespaces of other robots
+    pose_topic : topic of the chosen metric pose, whose heading is preferred
     """
 
-    def rank(source: Kind) -> tuple[bool, bool, float]:
+    def rank(source: SourceType) -> tuple[bool, bool, float]:
         home = _namespace(source.topic)
-        worth = source.score + (bonus.get(home, 0.0) if home else 0.0) + (SAME_MESSAGE if source.topic == same else 0.0)
-        return bool(source.problem) and source.topic != configured, home in others, -worth
+        score = source.score + (bonus.get(home, 0.0) if home else 0.0)
+        score += POSE_HEADING_BONUS if source.topic == pose_topic else 0.0
+        return bool(source.problem) and source.topic != configured, home in others, -score
 
     return sorted(sources, key=rank)
 
 
 def _namespace(topic: str) -> str:
-    """Return the first name of a topic with more than one."""
+    """Return the namespace of a topic: the first part of its name; empty for a name of one part."""
     parts = topic.strip("/").split("/")
     return parts[0] if len(parts) > 1 else ""
 
 
 def _other_robots(wheels: Sequence[WheelSource]) -> frozenset[str]:
-    """Return the namespaces in which another robot's wheels of the same type turn."""
+    """Return the namespaces of wheels with the same message type as the best ones, which belong to other robots."""
     if not wheels:
         return frozenset()
     best = wheels[0]
-    alike = (w for w in wheels if not w.problem and w.score >= WORTHY and w.message_type == best.message_type)
+    alike = (
+        w for w in wheels if not w.problem and w.score >= LEAST_MEASURED_SCORE and w.message_type == best.message_type
+    )
     return frozenset(_namespace(w.topic) for w in alike) - {_namespace(best.topic), ""}
 
 
 def choose_streams(
     candidates: Candidates, config: Config, log: str, channels: Sequence[Channel], lost: str = ""
 ) -> Choice:
-    """Return the source of each role; `lost`: what of the log could not be read.
+    """Return the source of each role.
+
+    Parameters
+    ----------
+    log : path of the log in errors
+    channels : all channels of the log, for errors
+    lost : text about unreadable parts of the log, for errors
 
     Raises
     ------
     ConfigError
-        A configured topic is not in the log, or cannot feed its role; a configured joint is not among the wheels'.
+        A configured topic is not in the log, or cannot feed its role; or no message lists a configured joint.
     MissingStreamError
-        No candidate for one role or more; the error names them all and lists what the log holds.
+        A role has no usable candidate. The error names all such roles and lists the topics of the log.
     """
     topics = config.topics
     topics_of_wheels = topics.wheels
     if sides := topics.fields_of_wheels:
         _check_sides(sides, candidates, log, channels)
         topics_of_wheels = " + ".join(sides.values())
-    wheels = _chosen(candidates.wheels, topics_of_wheels)
+    wheels = _choose_source(candidates.wheels, topics_of_wheels)
     check_joints(wheels, candidates.wheels, config)
     _check_roles(topics, candidates, log, channels)
-    gnss, heading = _chosen(candidates.gnss, topics.gnss), _chosen(candidates.heading, topics.heading)
+    gnss, heading = _choose_source(candidates.gnss, topics.gnss), _choose_source(candidates.heading, topics.heading)
     if wheels is None or gnss is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
         missing = [role for role, source in by_role.items() if source is None]
@@ -247,15 +277,15 @@ def choose_streams(
                     refused.setdefault(topic, {})[source.problem] = None
         reasons = candidates.unread | {topic: ", ".join(problems) for topic, problems in refused.items()}
         needs = {ROLE_WORDS[role]: NEEDS[role] for role in missing}
-        raise MissingStreamError(log, needs, _listing(channels, reasons), lost)
+        raise MissingStreamError(log, needs, _list_topics(channels, reasons), lost)
     return Choice(wheels, gnss, heading)
 
 
 def other_references(candidates: Candidates, choice: Choice, config: Config) -> tuple[Choice, ...]:
-    """Return the choice with each other position reference that may be better than the chosen one.
+    """Return a choice for each other position reference that may be better than the chosen one.
 
-    A pose brings its own heading; GNSS receivers next to the chosen one are no other reference. A configured topic of
-    position or heading has precedence: then there is none.
+    A pose is used with its own heading. A second GNSS receiver is no other reference. If a topic of position or heading
+    is configured, no other reference is returned.
     """
     if config.topics.gnss is not None or config.topics.heading is not None:
         return ()
@@ -263,24 +293,31 @@ def other_references(candidates: Candidates, choice: Choice, config: Config) -> 
     home, others = _namespace(choice.wheels.topic), _other_robots(candidates.wheels)
     choices = []
     for source in candidates.gnss:
-        foreign = _namespace(source.topic) in others - {home} or bool(FUSED_WORDS.search(source.topic))
-        same_kind = source.metric is None and choice.gnss.metric is None
-        if source.topic == choice.gnss.topic or source.problem or foreign or same_kind:
+        is_excluded = _namespace(source.topic) in others - {home} or bool(FUSED_WORDS.search(source.topic))
+        both_geodetic = source.metric is None and choice.gnss.metric is None
+        if source.topic == choice.gnss.topic or source.problem or is_excluded or both_geodetic:
             continue
-        wanted = {source.topic} if source.metric is not None else {one.topic for one in candidates.heading} - poses
-        heading = next((one for one in candidates.heading if one.topic in wanted and not one.problem), None)
+        wanted = (
+            {source.topic}
+            if source.metric is not None
+            else {candidate.topic for candidate in candidates.heading} - poses
+        )
+        heading = next(
+            (candidate for candidate in candidates.heading if candidate.topic in wanted and not candidate.problem), None
+        )
         if heading is not None:
             choices.append(Choice(choice.wheels, source, heading))
     return tuple(choices[:MOST_REFERENCES])
 
 
 def _check_sides(sides: Mapping[str, str], candidates: Candidates, log: str, channels: Sequence[Channel]) -> None:
-    """Refuse a configured pair of fields, by key, that the log does not have or that cannot be used."""
+    """Refuse configured fields of the wheels that the log lacks or that cannot be used; raise `ConfigError`."""
     for side, name in sides.items():
         key, topic = f"topics.{side}", topic_of_side(name)
         needed = f"name the field of one side as {topic}.left or {topic}.data[0]"
-        if (kind := _type_in(log, channels, candidates.unread, key, topic)) not in PAIR_TYPES and topic == name:
-            raise ConfigError(key, f"{topic}: {kind} is not the number of one side", needed)
+        message_type = _type_in(log, channels, candidates.unread, key, topic)
+        if message_type not in PAIR_TYPES and topic == name:
+            raise ConfigError(key, f"{topic}: {message_type} is not the number of one side", needed)
         if topic in candidates.unread:
             raise ConfigError(key, f"{topic}: {candidates.unread[topic]}", needed)
     if candidates.wheels and candidates.wheels[0].is_empty:
@@ -289,17 +326,20 @@ def _check_sides(sides: Mapping[str, str], candidates: Candidates, log: str, cha
 
 
 def _check_roles(topics: TopicsConfig, candidates: Candidates, log: str, channels: Sequence[Channel]) -> None:
-    """Refuse a configured topic that the log does not have or that has no usable row; other problems do not count."""
+    """Refuse a configured topic that the log lacks or that has no usable row; raise `ConfigError`.
+
+    Other problems of a configured topic are ignored.
+    """
     for role, sources in candidates.by_role().items():
         if (configured := getattr(topics, role)) is None:
             continue
         key, needed = f"topics.{role}", f"it needs {NEEDS[role]}"
-        kind = _type_in(log, channels, candidates.unread, key, configured)
+        message_type = _type_in(log, channels, candidates.unread, key, configured)
         if not sources:
-            if role == "wheels" and kind in PAIR_TYPES:
+            if role == "wheels" and message_type in PAIR_TYPES:
                 needed = "name both sides in topics.wheel_left and topics.wheel_right"
             raise ConfigError(
-                key, f"{configured}: {candidates.unread.get(configured, f'{kind} cannot feed it')}", needed
+                key, f"{configured}: {candidates.unread.get(configured, f'{message_type} cannot feed it')}", needed
             )
         if sources[0].is_empty:
             raise ConfigError(key, f"{configured}: {sources[0].problem or 'nothing usable in it'}", needed)
@@ -315,13 +355,13 @@ def _type_in(log: str, channels: Sequence[Channel], unread: Mapping[str, str], k
     """
     types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     if topic not in types:
-        advice = f"{did_you_mean(topic, types)}it holds {', '.join(_listing(channels, unread))}"
+        advice = f"{did_you_mean(topic, types)}it holds {', '.join(_list_topics(channels, unread))}"
         raise ConfigError(key, f"{topic} is not in {log}", advice)
     return types[topic]
 
 
-def _chosen(sources: Sequence[Kind], configured: str | None) -> Kind | None:
-    """Return the first source that can be used, with the reason for the choice; None without one."""
+def _choose_source(sources: Sequence[SourceType], configured: str | None) -> SourceType | None:
+    """Return the first usable source, with the reason for the choice in its `why`; None without a usable source."""
     best = next((source for source in sources if not source.problem or source.topic == configured), None)
     if best is None:
         return None
@@ -330,8 +370,8 @@ def _chosen(sources: Sequence[Kind], configured: str | None) -> Kind | None:
     return replace(best, why=best.why + (over if configured is None else "; configured"))
 
 
-def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[str]:
-    """Return the log's topics with their types, refused candidates first."""
+def _list_topics(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[str]:
+    """Return a text for each topic of the log: name, message type, reason of a refusal; refused topics come first."""
     entries: dict[str, str] = {}
     for channel in channels:
         reason = f": {reasons[channel.topic]}" if channel.topic in reasons else ""
@@ -347,19 +387,19 @@ JOINT_KEYS = ("left_joints", "right_joints")
 
 
 def check_joints(chosen: WheelSource | None, candidates: Sequence[WheelSource], config: Config) -> None:
-    """Refuse a configured joint that no message of the wheels' topic lists: its side would be the mean of fewer wheels.
+    """Refuse a configured joint that no message of the wheels' topic lists; its side would be a mean of fewer wheels.
 
     Parameters
     ----------
-    chosen : the wheels that would be used, None where there are none
-    candidates : all wheels that were found; where `chosen` lists no joints they are looked for here
+    chosen : the chosen wheels, None without usable wheels
+    candidates : all wheels that were found; if `chosen` lists no joints, the topic with the most configured joints is
+        named in the error
 
     Raises
     ------
     ConfigError
-        The first such joint, with the listed joints.
+        No message lists a configured joint.
     """
-    # If the chosen topic lists no joints, none of the others has the configured ones: name the closest one.
     listing = [chosen] if chosen is not None and chosen.joints else [motion for motion in candidates if motion.joints]
     unlisted = [
         [(key, name) for key in JOINT_KEYS for name in getattr(config.wheels, key) if name not in motion.joints]
@@ -373,7 +413,7 @@ def check_joints(chosen: WheelSource | None, candidates: Sequence[WheelSource], 
 
 
 def ignored_joints(chosen: WheelSource, config: Config) -> list[Note]:
-    """Return a warning for every configured joint list that is not used, because the messages list no joints."""
+    """Return a finding for each configured list of joints that is not used because the messages list no joints."""
     if chosen.joints:
         return []
     why = f"{chosen.topic} ({chosen.message_type}) lists no joints by name"

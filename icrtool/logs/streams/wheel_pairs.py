@@ -1,4 +1,4 @@
-"""Wheels as one number of each side: two topics, two fields of messages of any type, or the elements of an array."""
+"""Readers of wheels with one number for each side: two topics, two fields of any message type, or an array."""
 
 from __future__ import annotations
 
@@ -22,7 +22,15 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.bursts import spread_bursts
 from icrtool.logs.streams.counters import TURN_MODULI, Modulus, find_modulus, register_size, unwrap_counter
 from icrtool.logs.streams.message_types import KNOWN_TYPES
-from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, share_clock, stamp_rows
+from icrtool.logs.streams.sources import (
+    Sides,
+    StampedRows,
+    WheelSource,
+    make_wheel_source,
+    share_clock,
+    stamp_rows,
+    topic_fields,
+)
 from icrtool.logs.streams.wheels import (
     COMMAND_NOTES,
     COMMANDED,
@@ -37,10 +45,11 @@ from icrtool.records.text import LogText
 
 _NUMBERS = ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32", "UInt64")
 BYTE_TYPES = {"std_msgs/Int8", "std_msgs/UInt8"}
-"""Message types that may hold a counter of 8 bits or, for example, the state of a lamp: the topic's name decides."""
+"""Message types that may hold a counter of 8 bits, or something else, such as the state of a lamp. The name of the
+topic decides."""
 
 PAIR_TYPES = {f"std_msgs/{name}" for name in _NUMBERS} | BYTE_TYPES
-"""Message types that hold one number of one side."""
+"""Message types that may hold the number of one side."""
 
 ARRAY_TYPES = {f"std_msgs/{name}MultiArray" for name in _NUMBERS}
 """Message types that may hold the numbers of all wheels."""
@@ -51,43 +60,44 @@ _OTHER_WORDS = re.compile(
     r"current|volt|temp|power|torque|effort|force|pwm|duty|status|error|fault|limit|gain|stamp|time|range",
     re.IGNORECASE,
 )
-"""Words in fields of a motor driver's messages that are no motion."""
+"""Words in names of fields of motor drivers that hold no motion."""
 
 _SIDE_WORDS = re.compile("left|right", re.IGNORECASE)
 _ONLY_SIDE = re.compile(
     r"(?:(?:left|right|front|rear|wheels?|tracks?|motor|drive|side|value|data)_?|\d)+", re.IGNORECASE
 )
-"""A field whose name states only the side: the name of the topic or message states what it is."""
+"""Pattern of the names of fields that state only the side; the name of the topic or message states the quantity."""
 
 _OF_WHEELS = re.compile(
     rf"{WHEEL_WORDS.pattern}|tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|roboteq|roboclaw", re.IGNORECASE
 )
-"""Words of a message about wheels; the last ones are makes of motor controllers."""
+"""Words in names of topics, types or fields about wheels; the last words are brands of motor controllers."""
 
-MOST_LOOKED_AT = 1 << 21
-"""Largest number of characters of definitions in a log that are searched for words of wheels."""
+MOST_SCANNED = 1 << 21
+"""Largest number of characters of the definitions of a log that are searched for words about wheels."""
 
 MOST_SEARCHED = 1 << 17
-"""Largest number of characters of definitions with words of wheels, whose fields are searched for sides: some ten
-types."""
+"""Largest number of characters of the definitions with words about wheels that are parsed, for about ten types."""
 
 MOST_PATHS = 1 << 20
-"""Largest number of characters of the paths of the fields that are found."""
+"""Largest number of characters of the paths of all fields that are found."""
 
 MOST_PAIRS = 256
-"""Largest number of pairs of sides of a log that are tried."""
+"""Largest number of pairs of sides of a log that are read."""
 
-_HOLD_NS = 500_000_000
+_LONGEST_HOLD_NS = 500_000_000
 """Longest time for which the last value of the side that ends first is held [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """A number of one side in the messages of a topic.
+    """The number of one side in the messages of a topic.
 
     Attributes
     ----------
-    path : its field, ``data``, ``left_ticks``, ``drivers[0].speed``; for several elements, ``data[0,2]``, their mean
+    table : messages of the topic
+    path : field of the number, such as ``data``, ``left_ticks`` or ``drivers[0].speed``; ``data[0,2]`` is the mean of
+        two elements
     """
 
     table: TopicTable
@@ -95,11 +105,11 @@ class Side:
 
     @property
     def name(self) -> LogText:
-        """The name as `topics.wheel_left` has it: the topic, and after a dot the field where it is not ``data``."""
+        """Name for `topics.wheel_left`: the topic, and after a dot the field if it is not ``data``."""
         return LogText(_name(LogText(self.table.topic).raw, self.path))
 
     def columns(self) -> list[NDArray[Any]]:
-        """Return its numbers (n,) as recorded, of each element that the path names.
+        """Return the recorded numbers (n,) of each element that the path names.
 
         Raises
         ------
@@ -116,7 +126,7 @@ class Side:
 
 
 class PairNumbers(NamedTuple):
-    """The numbers of both sides (n,), counters continued, and the modulus at which they begin again, if found."""
+    """The numbers of both sides (n,), continued beyond the modulus of a counter, and this modulus; None without one."""
 
     left: NDArray[Any]
     right: NDArray[Any]
@@ -124,7 +134,7 @@ class PairNumbers(NamedTuple):
 
 
 def numbers_of(left: Side, right: Side, config: Config) -> PairNumbers:
-    """Return the numbers of two sides; the mean where a side has several elements.
+    """Return the numbers of two sides; for a side with several elements their mean.
 
     Raises
     ------
@@ -139,13 +149,13 @@ def numbers_of(left: Side, right: Side, config: Config) -> PairNumbers:
             modulus = Modulus(256.0)
     means = []
     for side in sides:
-        wheels = [_unwrapped(column, modulus) for column in side]
+        wheels = [_continue_counter(column, modulus) for column in side]
         means.append(wheels[0] if len(wheels) == 1 else np.asarray(np.mean(wheels, axis=0)))
     return PairNumbers(means[0], means[1], modulus)
 
 
 def _is_speed(side: Side, config: Config) -> bool:
-    """Return whether the configuration, or the name of a field or topic, states that numbers are speeds."""
+    """Return whether the configuration, or the name of the field or topic, states that the numbers are speeds."""
     if config.wheels.quantity != "auto":
         return config.wheels.quantity == "velocity"
     found = (
@@ -155,16 +165,17 @@ def _is_speed(side: Side, config: Config) -> bool:
 
 
 def topic_of_side(name: str) -> str:
-    """Return the topic in a side's name; names of topics hold no dot."""
+    """Return the topic in the name of a side, up to the dot; names of topics contain no dot."""
     return name.partition(".")[0]
 
 
 def _name(topic: str, path: str) -> str:
+    """Return the name of a side for `topics.wheel_left`."""
     return topic if path == "data" else f"{topic}.{path}"
 
 
 def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, set[str]]:
-    """Return, by channel id, the fields that may be one side, or that hold all wheels."""
+    """Return the fields that may be one side, or hold all wheels, by channel id."""
     fields: dict[int, set[str]] = {channel.id: set() for channel in channels}
     if named := topics.fields_of_wheels:
         for topic, _, path in (name.partition(".") for name in named.values()):
@@ -176,64 +187,64 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
     search = _Search()
     for channel in channels:
         if topics.wheels in (None, channel.topic):
-            alike = names.setdefault(channel.message_type, {})
+            names_of_type = names.setdefault(channel.message_type, {})
             for path in _fields_of(channel, search):
-                alike.setdefault(_name(channel.topic, path), []).append((channel.id, path))
-    for alike in names.values():
-        for left, places in alike.items():
-            right = right_twin(left, alike)
+                names_of_type.setdefault(_name(channel.topic, path), []).append((channel.id, path))
+    for names_of_type in names.values():
+        for left, fields_of_left in names_of_type.items():
+            right = find_right_twin(left, names_of_type)
             if right is not None or "[" in left:
-                for number, path in [*places, *alike.get(right or "", [])]:
+                for number, path in [*fields_of_left, *names_of_type.get(right or "", [])]:
                     fields[number].add(path)
     return fields
 
 
 @dataclass(slots=True)
 class _Search:
-    """Results of the search in the definitions of a log, each searched once, and the limits that are left.
+    """Search for wheels in the definitions of a log, with limits; each definition is searched once.
 
     Attributes
     ----------
-    looked_at, paths : characters that are left
-    searched : limit of what is parsed
-    of_wheels : by type and definition, whether words of wheels and of sides are in it
-    fields : by type and definition, the paths of its numbers
+    scan_left, paths_left : remaining characters of definitions and of paths
+    budget : remaining cost of definitions that are parsed
+    words : by type and definition, whether the definition has a word of a side, and a word about wheels
+    fields : by type and definition, the paths of the numbers
     """
 
-    looked_at: int = MOST_LOOKED_AT
-    searched: DefinitionBudget = field(default_factory=lambda: DefinitionBudget(MOST_SEARCHED))
-    paths: int = MOST_PATHS
-    of_wheels: dict[tuple[str, str], tuple[bool, bool]] = field(default_factory=dict)
+    scan_left: int = MOST_SCANNED
+    budget: DefinitionBudget = field(default_factory=lambda: DefinitionBudget(MOST_SEARCHED))
+    paths_left: int = MOST_PATHS
+    words: dict[tuple[str, str], tuple[bool, bool]] = field(default_factory=dict)
     fields: dict[tuple[str, str], list[str]] = field(default_factory=dict)
 
     def words_of(self, channel: Channel) -> tuple[bool, bool]:
-        """Return whether the definition of a channel has a word of a side, and one of wheels."""
-        one = (channel.message_type, channel.definition)
-        if one not in self.of_wheels:
-            self.looked_at -= len(channel.definition)
-            text = channel.definition if self.looked_at >= 0 else ""
-            self.of_wheels[one] = bool(_SIDE_WORDS.search(text)), bool(_OF_WHEELS.search(text))
-        return self.of_wheels[one]
+        """Return whether the definition of a channel has a word of a side, and a word about wheels."""
+        key = (channel.message_type, channel.definition)
+        if key not in self.words:
+            self.scan_left -= len(channel.definition)
+            text = channel.definition if self.scan_left >= 0 else ""
+            self.words[key] = bool(_SIDE_WORDS.search(text)), bool(_OF_WHEELS.search(text))
+        return self.words[key]
 
     def fields_of(self, channel: Channel) -> list[str]:
         """Return the paths of the numbers in the messages of a channel; none beyond the limits of the search."""
-        one = (channel.message_type, channel.definition)
-        if one not in self.fields:
-            self.fields[one] = []
+        key = (channel.message_type, channel.definition)
+        if key not in self.fields:
+            self.fields[key] = []
             with suppress(DefinitionError):
-                self.searched.take(channel)
-                self.fields[one] = number_fields(channel)
+                self.budget.take(channel)
+                self.fields[key] = number_fields(channel)
         fields = []
-        for path in self.fields[one]:
-            self.paths -= len(path) + len(channel.topic)
-            if self.paths < 0:
+        for path in self.fields[key]:
+            self.paths_left -= len(path) + len(channel.topic)
+            if self.paths_left < 0:
                 break
             fields.append(path)
         return fields
 
 
 def _fields_of(channel: Channel, search: _Search) -> list[str]:
-    """Return the fields of a channel's messages that may belong to wheels; for unknown types, by their names."""
+    """Return the fields of a channel's messages that may belong to wheels, by the names of topic, type and fields."""
     topic, message_type = channel.topic, channel.message_type
     if message_type in PAIR_TYPES:
         return ["data"] if _may_be_side(topic, message_type, "data") else []
@@ -241,14 +252,14 @@ def _fields_of(channel: Channel, search: _Search) -> list[str]:
         return ["data[*]"] if _OF_WHEELS.search(topic) and not _OTHER_WORDS.search(topic) else []
     if message_type in KNOWN_TYPES:
         return []
-    name, (side, of_wheels) = f"{topic} {message_type}", search.words_of(channel)
-    if not ((side or _SIDE_WORDS.search(name)) and (of_wheels or _OF_WHEELS.search(name))):
+    name, (has_side, has_wheels) = f"{topic} {message_type}", search.words_of(channel)
+    if not ((has_side or _SIDE_WORDS.search(name)) and (has_wheels or _OF_WHEELS.search(name))):
         return []
     return [path for path in search.fields_of(channel) if _may_be_side(topic, message_type, path)]
 
 
 def _may_be_side(topic: str, message_type: str, path: str) -> bool:
-    """Return whether a field may be a wheel's motion: a driver's messages hold currents and states, too."""
+    """Return whether a field may be the motion of a wheel, not a current or a state of a motor driver."""
     if message_type in BYTE_TYPES:
         return path == "data" and bool(_OF_WHEELS.search(topic)) and not _OTHER_WORDS.search(topic)
     if message_type in PAIR_TYPES:
@@ -261,7 +272,7 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
 
 
 def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelSource]:
-    """Return the wheels made of two sides: the configured ones, or all that the names of topics and fields show."""
+    """Return sources of two sides: the configured fields, or all pairs that the names of topics and fields show."""
     topics = config.topics
     if fields_named := topics.fields_of_wheels:
         by_topic: dict[str, TopicTable] = {table.topic: table for table in tables}
@@ -278,10 +289,10 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelS
                 side = Side(table, path)
                 sides_of.setdefault(table.message_type, {})[side.name] = side
     pairs = (
-        (left, alike[right])
-        for alike in sides_of.values()
-        for name, left in alike.items()
-        if (right := right_twin(name, alike)) is not None
+        (left, sides_of_type[right])
+        for sides_of_type in sides_of.values()
+        for name, left in sides_of_type.items()
+        if (right := find_right_twin(name, sides_of_type)) is not None
     )
     motions = [pair_motion(left, right, config) for left, right in islice(pairs, MOST_PAIRS)]
     arrays = (table for table in tables if table.message_type in ARRAY_TYPES and len(table))
@@ -289,47 +300,47 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelS
 
 
 def _array_motion(table: TopicTable, config: Config) -> WheelSource:
-    """Return the motion of wheels in an array; the side of the first one is taken as left.
+    """Return the motion of the wheels in an array; the side of its first element is taken as left.
 
-    A wheel's motion minus the mean of all wheels is its part of the turn, which has opposite signs on the two sides.
+    The motion of a wheel minus the mean of all wheels shows the turn, with opposite signs on the two sides.
     """
     values = table.column("data[*]")
     modulus = find_modulus(list(values.T), config.robot.encoder_counts_per_rev)
-    wheels = np.array([_unwrapped(column, modulus) for column in values.T])
+    wheels = np.array([_continue_counter(column, modulus) for column in values.T])
     turning = wheels - wheels.mean(axis=0)
     turning -= turning.mean(axis=1, keepdims=True)
-    alike = turning @ turning[0] > 0.0
-    if len(wheels) > 2 * MOST_WHEELS or not 0 < 2 * np.count_nonzero(alike) == len(wheels):
+    is_left = turning @ turning[0] > 0.0
+    if len(wheels) > 2 * MOST_WHEELS or not 0 < 2 * np.count_nonzero(is_left) == len(wheels):
         advice = f"name them in topics.wheel_left and wheel_right, as {_name(table.topic, 'data[0]')}"
-        return WheelSource(**of_topic(table), problem=f"it does not show as many left as right wheels; {advice}")
-    left, right = (f"data[{','.join(map(str, np.flatnonzero(side)))}]" for side in (alike, ~alike))
+        return WheelSource(**topic_fields(table), problem=f"it does not show as many left as right wheels; {advice}")
+    left, right = (f"data[{','.join(map(str, np.flatnonzero(side)))}]" for side in (is_left, ~is_left))
     return pair_motion(Side(table, left), Side(table, right), config)
 
 
 def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
-    """Return the wheel motion of two sides, at the left one's stamps.
+    """Return the wheel motion of two sides at the stamps of the left side.
 
-    Positions are interpolated, speeds are held.
+    Positions of the right side are interpolated, speeds are held.
     """
     topic = LogText(f"{left.name.raw} + {right.name.raw}")
-    kind = LogText(" + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right))))
+    message_type = LogText(" + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right))))
     commanded = bool(COMMANDED.search(left.name))
     score, why = (
         80.0 - (COMMANDED_PENALTY if commanded else 0.0),
         "a number of each side" + (" (commanded)" if commanded else ""),
     )
-    stamps, times, held = _common_stamps(left.table, right.table)
+    stamps, times, right_times = _common_stamps(left.table, right.table)
     try:
-        if not (len(times) and len(held)):
+        if not (len(times) and len(right_times)):
             raise DefinitionError(topic, f"{(right if len(times) else left).table.topic} holds no message")
         lefts, rights, modulus = numbers_of(left, right, config)
-        # Only while both were recorded: a side that is held for a long time would look like a turn.
-        slack = max(_half_interval(times), _half_interval(held))
-        both = (times >= held[0] - slack) & (times <= held[-1] + max(slack, _HOLD_NS))
+        # Only the time in which both sides were recorded is used: a side held for a long time would look like a turn.
+        slack = max(_half_interval(times), _half_interval(right_times))
+        both = (times >= right_times[0] - slack) & (times <= right_times[-1] + max(slack, _LONGEST_HOLD_NS))
         if not both.any():
             raise DefinitionError(topic, "the two sides were not recorded at the same time")
     except DefinitionError as err:
-        return WheelSource(topic=topic, message_type=kind, stamps=stamps, score=score, problem=err.why)
+        return WheelSource(topic=topic, message_type=message_type, stamps=stamps, score=score, problem=err.why)
     moments, first, integer = times[both], lefts[both].astype(np.float64), lefts.dtype.kind == "i"
     position: Sides = (None, None)
     speed: Sides = (None, None)
@@ -337,44 +348,44 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
     notes = COMMAND_NOTES if commanded else ()
     if modulus is not None or _is_position(left, lefts, config, integer=integer):
         unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
-        what = "ticks" if unit == "counts" else "angles or distances"
-        position = first, np.interp(moments, held, rights)
+        quantity = "ticks" if unit == "counts" else "angles or distances"
+        position = first, np.interp(moments, right_times, rights)
         if modulus is not None:
-            counted = f"its numbers begin again at {modulus.text}, as they show: counted on"
-            notes = (note("counter_begins_again", counted), *notes)
+            finding = f"the numbers show that they begin again at {modulus.text}: they are continued"
+            notes = (note("counter_begins_again", finding), *notes)
             if modulus.value in TURN_MODULI and not integer:
-                unit, what = "rad", "angles"
+                unit, quantity = "rad", "angles"
                 radians = 2 * np.pi / modulus.value
-                position = first * radians, np.interp(moments, held, rights) * radians
+                position = first * radians, np.interp(moments, right_times, rights) * radians
     else:
-        place = np.clip(np.searchsorted(held, moments + _half_interval(times), side="right") - 1, 0, None)
-        what, speed = "speeds", (first, rights[place].astype(np.float64))
+        row = np.clip(np.searchsorted(right_times, moments + _half_interval(times), side="right") - 1, 0, None)
+        quantity, speed = "speeds", (first, rights[row].astype(np.float64))
     header = None if stamps.header_ns is None else stamps.header_ns[both]
     far = None if stamps.far_ns is None else stamps.far_ns[both]
     stamps = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both], far_ns=far)
-    why = f"{why}: {what}"
-    return motion_of(
-        topic=topic, message_type=kind, stamps=stamps, position=position, speed=speed, unit=unit, score=score, why=why,
-        notes=notes,
+    why = f"{why}: {quantity}"
+    return make_wheel_source(
+        topic=topic, message_type=message_type, stamps=stamps, position=position, speed=speed, unit=unit, score=score,
+        why=why, notes=notes,
     )  # fmt: skip
 
 
 def twist_motion(speed: Side, turn: Side, config: Config) -> WheelSource:
-    """Return the body twist of two fields, forward speed [m/s] and turn rate [rad/s], at the stamps of the speed."""
+    """Return the body twist in two fields, forward speed [m/s] and turn rate [rad/s], at the stamps of the speed."""
     motion = pair_motion(speed, turn, replace(config, wheels=replace(config.wheels, quantity="velocity")))
     if motion.speed is None:
         return motion
-    kind = LogText(f"{LogText(motion.message_type).raw}{OWN_TWIST}")
-    why = "speed and turn rate of the body in fields of its own"
-    return replace(motion, message_type=kind, twist=np.column_stack(motion.speed), speed=None, why=why)
+    message_type = LogText(f"{LogText(motion.message_type).raw}{OWN_TWIST}")
+    why = "speed and turn rate of the body in the configured fields"
+    return replace(motion, message_type=message_type, twist=np.column_stack(motion.speed), speed=None, why=why)
 
 
 def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, Ints, Ints]:
-    """Return the stamps of the left side, and the times of both sides: of headers if both have them, else logged."""
+    """Return the stamps of the left side, and the times of both sides (n,) [ns]: header stamps if both have them."""
     rows = stamp_rows(left), stamp_rows(right)
-    headers = [one.header_ns for one in rows if one.header_ns is not None and (np.diff(one.header_ns) >= 0).all()]
-    clock_set = max(one.clock_set for one in rows)
-    stamps = replace(rows[0], backward_step=max(one.backward_step for one in rows), clock_set=clock_set)
+    headers = [side.header_ns for side in rows if side.header_ns is not None and (np.diff(side.header_ns) >= 0).all()]
+    clock_set = max(side.clock_set for side in rows)
+    stamps = replace(rows[0], backward_step=max(side.backward_step for side in rows), clock_set=clock_set)
     if len(headers) == 2:
         return stamps, spread_bursts(headers[0]).stamp_ns, spread_bursts(headers[1]).stamp_ns
     why = rows[0].note or rows[1].note or "the header stamps of a side go back"
@@ -384,12 +395,15 @@ def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, In
 
 
 def _half_interval(times: Ints) -> int:
-    """Return half the median interval [ns]: messages of one control cycle are logged closer together than this."""
+    """Return half the median interval [ns]. Messages of one control cycle are logged at a shorter distance."""
     return int(np.median(np.diff(times))) // 2 if len(times) > 1 else 0
 
 
-def _unwrapped(values: NDArray[Any], modulus: Modulus | None) -> NDArray[Any]:
-    """Return a counter (n,) continued past its modulus; None: past the smaller of 16 and 32 bits that holds it."""
+def _continue_counter(values: NDArray[Any], modulus: Modulus | None) -> NDArray[Any]:
+    """Return a counter (n,) continued beyond its modulus.
+
+    Without a modulus, whole numbers are continued as a counter of 16 or 32 bits, and other numbers are returned.
+    """
     if not len(values) or (modulus is None and values.dtype.kind == "f"):
         return values
     size = modulus.value if modulus is not None else register_size(values)
@@ -397,7 +411,7 @@ def _unwrapped(values: NDArray[Any], modulus: Modulus | None) -> NDArray[Any]:
 
 
 def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: bool) -> bool:
-    """Return whether a pair's numbers are positions (ticks, angles), not speeds."""
+    """Return whether the numbers of a side (n,) are positions (ticks, angles), not speeds."""
     if config.wheels.quantity != "auto":
         return config.wheels.quantity in ("position", "counts")
     for name in (side.path, side.table.topic):
@@ -408,16 +422,16 @@ def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: b
     finite = values[np.isfinite(values)]
     if len(finite) < 3 or np.ptp(finite) == 0:
         return integer
-    # A position's steps add up to about its range; a speed varies around few values.
+    # The steps of a position add up to about its range. A speed varies around a few values.
     return bool(np.abs(np.diff(finite)).sum() < 3.0 * np.ptp(finite) and np.ptp(finite) > 5.0)
 
 
 _LONE_L = re.compile(r"(?<![^\W\d_])[lL]|(?<=[^\W\d_A-Z])L|[lL](?![^\W\d_])")
-"""A letter that begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
+"""Pattern of a letter L that begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
 
 
-def right_twin(left: str, names: Container[str]) -> str | None:
-    """Return the name that is `left` with left replaced by right; None when there is none."""
+def find_right_twin(left: str, names: Container[str]) -> str | None:
+    """Return the name in `names` that is `left` with left replaced by right; None without such a name."""
     for old, new in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
         if old in left:
             twin = left.replace(old, new)

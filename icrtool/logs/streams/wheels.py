@@ -1,4 +1,4 @@
-"""Messages that hold the motion of the wheels, in one form: position or speed of two sides, or a body twist."""
+"""Readers of messages with the motion of the wheels: positions or speeds of two sides, or a body twist."""
 
 from __future__ import annotations
 
@@ -17,57 +17,66 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, unwrapped
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import LARGEST_PLACE_M, REFERENCE_WORDS
-from icrtool.logs.streams.sources import NEVER_MOVES, Sides, WheelSource, motion_of, of_topic, wheels_move
+from icrtool.logs.streams.sources import (
+    NEVER_MOVES_PENALTY,
+    Sides,
+    WheelSource,
+    make_wheel_source,
+    topic_fields,
+    wheels_move,
+)
 from icrtool.records.notes import Note, note
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import listed
 
 ONE_TURN_RAD = 2 * np.pi + 1e-3
-"""Largest range of positions that are recorded modulo a turn [rad]."""
+"""Largest range of positions that are recorded modulo one turn [rad]."""
 
 LEAST_WRAP_RAD = 1.5 * np.pi
-"""Least jump of a position that is a wrap of a turn [rad]."""
+"""Smallest step of a position that passes the end of a turn [rad]."""
 
 FEWEST_WRAPS = 2
-"""Least number of wraps that show that positions are recorded modulo a turn."""
+"""Smallest number of such steps that show that positions are recorded modulo one turn."""
 
 Quantity = Literal["position", "speed"]
 
 MOST_WHEELS = 32
-"""Largest number of wheels of a side. A message that lists more is not of wheels, or is an attack on the reader."""
+"""Largest number of wheels of a side. A message that lists more is not of wheels, or is made to fill the memory."""
 
 
-def of_wheels(
+def average_wheels(
     wheels: Callable[[Quantity], list[NDArray[Any]]], lefts: int, names: Sequence[str], unit: WheelUnit, **others: Any
 ) -> WheelSource:
     """Return the mean over the wheels of each side; wheels without an encoder, or with a dead encoder, are left out.
 
     Parameters
     ----------
-    wheels : returns the positions, or the speeds, (n,) of each wheel, the left ones first; none where not recorded
+    wheels : returns the positions or the speeds (n,) of each wheel, the left wheels first; an empty list where they are
+        not recorded
     lefts : number of wheels of the left side
-    names : of the wheels
-    others : what else `motion_of` takes
+    names : names of all wheels
+    unit : unit of the positions, and of the speeds per second
+    others : further arguments of `make_wheel_source`
     """
     means: dict[Quantity, Sides] = {"position": (None, None), "speed": (None, None)}
     dead: set[int] = set()
-    # One wheel after the other: the columns of all wheels of a long log are large.
+    # Positions and speeds are read one after the other, because the columns of all wheels of a long log are large.
     for quantity in means:
         columns = wheels(quantity)
         if columns:
-            # unwound before the mean of a side: a front and a rear wheel do not complete a turn at the same time
+            # Turns are unwound before the mean of a side, because its wheels do not complete a turn at the same time.
             turns_modulo = quantity == "position" and unit == "rad"
-            means[quantity], stuck = _side_means([*map(unwound_turns, columns)] if turns_modulo else columns, lefts)
+            means[quantity], stuck = _side_means([*map(unwind_turns, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
-    why = f"{listed([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
+    why = f"{listed([names[i] for i in sorted(dead)])} never turns, but the other wheels of its side do: left out"
     notes = (note("wheel_dead", why),) if dead else ()
-    return motion_of(position=means["position"], speed=means["speed"], unit=unit, notes=notes, **others)
+    return make_wheel_source(position=means["position"], speed=means["speed"], unit=unit, notes=notes, **others)
 
 
 def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set[int]]:
-    """Return the mean over the wheels of each side that have finite values, None where none has; and the dead ones.
+    """Return the mean over the wheels of each side with finite values (None without such a wheel), and the dead wheels.
 
-    A wheel that never changes while another one of its side does has a dead encoder.
+    A wheel has a dead encoder if its values never change while the values of another wheel of its side do.
     """
     changes = np.array([np.fmax.reduce(column) > np.fmin.reduce(column) for column in columns])
     means: list[Floats | None] = []
@@ -76,7 +85,7 @@ def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set
         dead |= {wheel for wheel in side if not changes[wheel] and changes[side].any()}
         columns_of_side = [columns[wheel] for wheel in side if wheel not in dead and np.isfinite(columns[wheel]).any()]
         if len(columns_of_side) > 1:
-            # infinity less infinity would warn
+            # Infinite values are replaced by NaN, because infinity minus infinity makes NumPy warn.
             finite = (np.where(np.isinf(column), np.nan, column) for column in columns_of_side)
             means.append(sum(finite, np.zeros(len(columns_of_side[0]))) / len(columns_of_side))
         else:
@@ -84,9 +93,10 @@ def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set
     return (means[0], means[1]), dead
 
 
-def unwound_turns(position: Floats) -> Floats:
-    """Return positions [rad] (n,) of a wheel; those recorded modulo one turn are unwrapped."""
-    with np.errstate(invalid="ignore"):  # infinity less infinity is not within a turn
+def unwind_turns(position: Floats) -> Floats:
+    """Return positions of a wheel (n,) [rad], unwrapped if they are recorded modulo one turn."""
+    # Infinity minus infinity is NaN, which is not within a turn.
+    with np.errstate(invalid="ignore"):
         if not np.fmax.reduce(position) - np.fmin.reduce(position) <= ONE_TURN_RAD:
             return position
     finite = np.flatnonzero(np.isfinite(position))
@@ -103,7 +113,7 @@ _ELEMENTS = re.compile(r"\[([\d,]+)\]")
 
 
 def column_and_places(path: str) -> tuple[str, list[int]]:
-    """Return the column that holds a field, and the places in it: ``data[0,2]`` is of ``data[*]``."""
+    """Return the column that holds a field, and the indices of its elements: ``data[*]``, [0, 2] for ``data[0,2]``."""
     match = _ELEMENTS.search(path)
     places = [int(place) for place in match[1].split(",") if place] if match is not None else []
     return _ELEMENTS.sub("[*]", path, count=1), places
@@ -111,16 +121,18 @@ def column_and_places(path: str) -> tuple[str, list[int]]:
 
 @dataclass(frozen=True, slots=True)
 class FixedWheels:
-    """A message type that has the wheels of each side in fields of their own, or at fixed places of lists.
+    """A message type that has the wheels of each side in separate fields, or at fixed places of lists.
 
     Attributes
     ----------
-    what, worth : what it is called where it is chosen, and how suitable it is
-    position, speed : fields of the left and of the right side; for several places in a list, their mean
-    unit : unit of the positions, and per second of the speeds; factor : converts recorded numbers to it
+    label : name of the data, for the reason of a choice
+    worth : score of the type; the source with the highest score is chosen
+    position, speed : fields of the left and of the right side; for several elements of a list, their mean
+    unit : unit of the positions, and of the speeds per second
+    factor : factor that converts recorded numbers to `unit`
     """
 
-    what: str
+    label: str
     worth: float
     position: tuple[str, ...] = ()
     speed: tuple[str, ...] = ()
@@ -155,27 +167,37 @@ class FixedWheels:
 
         lefts, rights = (len(column_and_places(path)[1]) or 1 for path in self.position or self.speed)
         names = [f"wheel {i}" for i in range(lefts + rights)]
-        return of_wheels(wheels_of, lefts, names, self.unit, **of_topic(table), score=self.worth, why=self.what)
+        return average_wheels(
+            wheels_of, lefts, names, self.unit, **topic_fields(table), score=self.worth, why=self.label
+        )
 
 
 _HALF_COUNTER = 1 << 31
+"""Half of the modulus of the counters of xbot_msgs/WheelTick."""
+
 TICK_FIELDS = (
     "wheel_tick_factor",
     "valid_wheels",
-    *(f"wheel_{what}_{place}" for what in ("ticks", "direction") for place in ("fl", "fr", "rl", "rr")),
+    *(f"wheel_{field}_{place}" for field in ("ticks", "direction") for place in ("fl", "fr", "rl", "rr")),
 )
 
 
 def read_ticks(table: TopicTable, _: Config) -> WheelSource:
-    """Return the motion in xbot_msgs/WheelTick: counters that only count up, and the direction of each wheel.
+    """Return the motion in messages of xbot_msgs/WheelTick: counters that only count up, and directions of the wheels.
 
-    A step has the direction that is stated after it, as in OpenMower's own xbot_positioning. Its driver leaves
-    `valid_wheels` at 0; then the rear wheels are used.
+    A step has the direction in the message after it, as in OpenMower's xbot_positioning. The driver of OpenMower leaves
+    `valid_wheels` at 0; the rear wheels are then used.
+
+    Raises
+    ------
+    DefinitionError
+        The type, as the log defines it, lacks the counters.
     """
     valid = table.integers("valid_wheels")
     bits = int(np.bitwise_or.reduce(valid)) if valid is not None else 0
     axles = [place for place, both in (("f", 3), ("r", 12)) if bits & both == both] or ["r"]
-    with np.errstate(invalid="ignore"):  # infinite ones of both signs have no median
+    # The median of infinite numbers of both signs is NaN.
+    with np.errstate(invalid="ignore"):
         per_metre = float(np.median(table.floats("wheel_tick_factor")))
     has_scale = per_metre > 0
     sides = [np.zeros(len(table)), np.zeros(len(table))]
@@ -183,35 +205,35 @@ def read_ticks(table: TopicTable, _: Config) -> WheelSource:
         name = f"{axle}{'lr'[side]}"
         ticks, direction = table.integers(f"wheel_ticks_{name}"), table.column(f"wheel_direction_{name}")
         if ticks is None:
-            raise DefinitionError(table.topic, f"its {table.message_type} has no whole numbers wheel_ticks_{name}")
+            why = f"its type {table.message_type} has no field wheel_ticks_{name} with whole numbers"
+            raise DefinitionError(table.topic, why)
         steps = np.abs(np.mod(np.diff(ticks) + _HALF_COUNTER, 2 * _HALF_COUNTER) - _HALF_COUNTER)
         sides[side][1:] += np.cumsum(np.where(direction[1:] != 0, -steps, steps)) / len(axles)
     left, right = (side / (per_metre if has_scale else 1.0) for side in sides)
     unit: WheelUnit = "m" if has_scale else "counts"
     why = f"ticks of the {' and '.join({'f': 'front', 'r': 'rear'}[axle] for axle in axles)} wheels"
-    return motion_of(**of_topic(table), position=(left, right), unit=unit, score=90.0, why=why)
+    return make_wheel_source(**topic_fields(table), position=(left, right), unit=unit, score=90.0, why=why)
 
 
 COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.IGNORECASE)
 COMMAND_NOTES = (
     note(
         "wheels_commanded",
-        "commanded speeds, not measured ones: the difference to the wheels' motion is in the ICRs and delays",
+        "these are commanded speeds, not measured ones: their difference from the wheel speeds is in ICRs and delays",
     ),
 )
 COMMANDED_PENALTY = 40.0
-"""Subtracted from the score of a topic with commanded speeds."""
+"""Number that is subtracted from the score of a topic with commanded speeds."""
 
 _FUSED = re.compile(
     r"filter|fused|combined|ekf|ukf|visual|(?<![a-z])vi?o(?![a-z])|camera|stereo|zed|realsense|t265|vins|rtab|mavros|amcl",
     re.IGNORECASE,
 )
-"""Words in names of odometry and twists that are fused with other sensors; these are used only where nothing better
-exists."""
+"""Words in names of odometry and twists that are fused with other sensors. Such a topic gets a lower score."""
 
 SIDEWAYS_SHARE = 0.2
-"""Largest sideways share of a twist in the body frame; a twist with more, and without turns, is a velocity in east and
-north."""
+"""Largest ratio of sideways to forward motion of a twist in the body frame. A twist with a larger ratio and without
+turns is a velocity in east and north."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,13 +242,15 @@ class Twist:
 
     Attributes
     ----------
-    what, worth : what it is called where it is chosen, and how suitable it is
-    path : the field of the twist, with its dot
-    forward, sideways, turn : fields of it: the speeds [m/s] and the turn rate [rad/s, counter-clockwise]
-    fused : subtracted from the worth where the name shows a fused topic; 0: the base's own twist, whatever its name
+    label : name of the data, for the reason of a choice
+    worth : score of the type; the source with the highest score is chosen
+    path : path of the twist in the message, with a dot at its end
+    forward, sideways, turn : fields of the twist: speeds [m/s], and turn rate counter-clockwise [rad/s]
+    fused : number that is subtracted from the worth if the name shows a fused topic; 0 for types that only a robot base
+        sends
     """
 
-    what: str
+    label: str
     worth: float
     path: str = ""
     forward: str = "linear.x"
@@ -240,17 +264,17 @@ class Twist:
         return tuple(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn))
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
-        """Return the twist; a twist of a position reference, or in east and north, is refused."""
-        return self.of_twist(table)
+        """Return the twist of a topic; raise `DefinitionError` where the type lacks it."""
+        return self.read_twist(table)
 
-    def of_twist(self, table: TopicTable) -> WheelSource:
-        """Return the twist of a topic."""
+    def read_twist(self, table: TopicTable) -> WheelSource:
+        """Return the twist of a topic, with a `problem` if it is of a position reference, or in east and north."""
         forward, sideways, turn = (f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn))
         twist = np.column_stack([table.column(forward), table.column(turn)]).astype(np.float64)
         forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], table.floats(sideways)))
         score, why, known = (
             self.worth,
-            f"{self.what}, converted to wheel speeds with the track width",
+            f"{self.label}, converted to wheel speeds with the track width",
             tuple[Note, ...](),
         )
         score -= self.fused if _FUSED.search(table.topic) else 0.0
@@ -258,23 +282,26 @@ class Twist:
             score, why, known = score - COMMANDED_PENALTY, f"{why} (commanded)", COMMAND_NOTES
         problem = ""
         if not wheels_move(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
-            problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
+            problem = "moves sideways and never turns: it is a velocity in east and north, not in the body frame"
         elif self.fused and REFERENCE_WORDS.search(table.topic):
             problem = "its name is the name of a position reference, not of wheels"
-        return motion_of(**of_topic(table), twist=twist, unit="m", score=score, why=why, notes=known, problem=problem)
+        return make_wheel_source(
+            **topic_fields(table), twist=twist, unit="m", score=score, why=why, notes=known, problem=problem
+        )
 
 
 ODOMETRY_POSE_PATH = "pose.pose."
 ODOMETRY_POSE = tuple(
-    f"{ODOMETRY_POSE_PATH}{one}" for one in ("position.x", "position.y", *(f"orientation.{axis}" for axis in "xyzw"))
+    f"{ODOMETRY_POSE_PATH}{field}"
+    for field in ("position.x", "position.y", *(f"orientation.{axis}" for axis in "xyzw"))
 )
-"""The fields of an odometry's pose."""
+"""Fields of the pose of an odometry."""
 
 LEAST_POSE_TRAVEL_M, LEAST_POSE_TURN_RAD = 1.0, 0.5
-"""Distance and turn of a pose [m, rad] from which on it moves while its twist stays 0."""
+"""Smallest distance [m] and turn [rad] of a pose that is used in place of a twist that stays 0."""
 
 POSE_PENALTY = 20.0
-"""Subtracted from the score of an odometry whose twist stays 0: one with a twist is preferred."""
+"""Number that is subtracted from the score of an odometry whose twist stays 0, so that a twist is preferred."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,22 +314,22 @@ class Odometry(Twist):
         return (*(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn)), *ODOMETRY_POSE)
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
-        """Return the twist; where it stays 0 while the pose moves, the distance and the turn of the pose."""
-        wheels = self.of_twist(table)
+        """Return the twist, or, if it stays 0 while the pose moves, the distance and the turn of the pose."""
+        wheels = self.read_twist(table)
         if (
             wheels.twist is None
             or wheels_move(wheels.twist)
             or not all(path in table.columns for path in ODOMETRY_POSE)
         ):
             return wheels
-        travelled = travelled_by(*(table.floats(path) for path in ODOMETRY_POSE))
+        travelled = pose_travel(*(table.floats(path) for path in ODOMETRY_POSE))
         if travelled is None:
             return wheels
         why = (
-            f"{table.topic}: its twist stays 0 while its pose goes {travelled[-1, 0]:.1f} m forward: distance and turn "
-            "of the pose are taken as wheel odometry; topics.wheels names another topic"
+            f"{table.topic}: its twist stays 0 while its pose moves {travelled[-1, 0]:.1f} m forward: distance and "
+            "turn of the pose are used as wheel odometry; topics.wheels sets another topic"
         )
-        score = wheels.score + NEVER_MOVES - POSE_PENALTY
+        score = wheels.score + NEVER_MOVES_PENALTY - POSE_PENALTY
         words = "pose of the wheel odometry (its twist stays 0), converted to wheel speeds with the track width"
         return replace(
             wheels, travelled=travelled, score=score, why=words,
@@ -310,20 +337,25 @@ class Odometry(Twist):
         )  # fmt: skip
 
 
-def travelled_by(x: Floats, y: Floats, qx: Floats, qy: Floats, qz: Floats, qw: Floats) -> Floats | None:
-    """Return distance forward [m] and turn [rad] (n, 2) of poses; None where they do not move and turn.
+def pose_travel(x: Floats, y: Floats, qx: Floats, qy: Floats, qz: Floats, qw: Floats) -> Floats | None:
+    """Return distance forward [m] and turn [rad] (n, 2) of poses; None if they do not move and turn.
 
-    The distance of a step is its displacement along the heading in its middle: exact to the second order on an arc.
+    The distance of a step is its displacement along the heading in the middle of the step, which is exact on an arc.
+
+    Parameters
+    ----------
+    x, y : (n,) positions [m]
+    qx, qy, qz, qw : (n,) components of the quaternion
     """
-    sizes = [np.abs(one) for one in (x, y, qx, qy, qz, qw)]
-    # a rotation of size 1, and places within LARGEST_PLACE_M, so that squares do not overflow
+    sizes = [np.abs(column) for column in (x, y, qx, qy, qz, qw)]
+    # Numbers beyond LARGEST_PLACE_M are refused, so that squares do not overflow; a quaternion of zeros is no rotation.
     sound = np.logical_and.reduce([size < LARGEST_PLACE_M for size in sizes]) & (np.maximum(sizes[4], sizes[5]) > 0.0)
     if len(x) < 2 or not sound.all():
         return None
     yaw = unwrapped(np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2))
     middle, turn = (yaw[1:] + yaw[:-1]) / 2.0, np.diff(yaw)
     chord = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)
-    # the chord of an arc is shorter than the arc
+    # The chord of an arc is shorter than the arc by the factor sin(turn / 2) / (turn / 2).
     step = chord / np.sinc(turn / (2.0 * np.pi))
     if float(np.abs(step).sum()) < LEAST_POSE_TRAVEL_M or float(np.ptp(yaw)) < LEAST_POSE_TURN_RAD:
         return None
@@ -334,7 +366,7 @@ WHEEL_WORDS = re.compile(r"wheel|track(?!er|ing)|sprocket|drive|motor|tire|tyre"
 _OTHER_JOINTS = re.compile(
     r"(arm|pan|tilt|lift)\d*|(gripper|flipper|finger|steer|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension).*"
 )
-"""Words in the name of a joint that is no wheel. Only complete words count: "panther" is not "pan"."""
+"""Pattern of words in names of joints that are no wheels. It must match a complete word: "panther" is not "pan"."""
 
 _TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _LEFT_TOKENS = {"l", "left", "fl", "rl", "bl", "ml", "lf", "lb", "lr", "lm", "lh", "lwheel", "wl"}
@@ -342,18 +374,20 @@ _RIGHT_TOKENS = {"r", "right", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh", "
 
 
 def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Return the positions of the left and of the right wheel joints among the names of a message."""
+    """Return the indices of the left and of the right wheel joints among the names in a message."""
     sides = [(i, *side_of(name)) for i, name in enumerate(names)]
     any_named = any(named for _, side, named in sides if side)
-    left, right = ([i for i, side, named in sides if side == one and named >= any_named] for one in ("left", "right"))
+    left, right = (
+        [i for i, side, named in sides if side == wanted and named >= any_named] for wanted in ("left", "right")
+    )
     return left, right
 
 
 @lru_cache(4096)
 def side_of(name: str) -> tuple[Literal["left", "right", ""], bool]:
-    """Return the side of a joint that may be a wheel, empty for others, and whether its name is a wheel's name.
+    """Return the side of a joint that may be a wheel (empty for other joints), and whether its name is of a wheel.
 
-    The words of a name are found in ``wheel_FL_joint``, ``frontLeftWheel`` and ``panther/rl_wheel_joint``.
+    The words of names such as ``wheel_FL_joint``, ``frontLeftWheel`` and ``panther/rl_wheel_joint`` are separated.
     """
     words = {word.lower() for word in _TOKENS.findall(name.replace("_", " "))}
     left, right = "left" in name.lower(), "right" in name.lower()

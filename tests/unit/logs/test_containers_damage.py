@@ -912,5 +912,5 @@ def test_a_database_whose_write_ahead_log_was_not_copied_names_it(tmp_path):
         alone = tmp_path / name
         alone.write_bytes(recorded.read_bytes())
         database.close()
-        with pytest.raises(LogError, match=rf"{name}-wal is missing"):
+        with pytest.raises(LogError, match=rf"{name}-wal, which holds messages, is missing"):
             open_log(alone)

@@ -505,7 +505,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         container.LARGEST_DESCRIPTIONS_BYTES, definition_bounds.MOST_PARSED,
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
         recording_files.LARGEST_METADATA_BYTES, open_log.MOST_FILES, wheels.MOST_WHEELS,
-        wheel_pairs.MOST_LOOKED_AT, wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PATHS, wheel_pairs.MOST_PAIRS,
+        wheel_pairs.MOST_SCANNED, wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PATHS, wheel_pairs.MOST_PAIRS,
         LONGEST_HEAD_BYTES, MOST_COLUMNS, config.LARGEST_FILE_BYTES, recordings.LARGEST_MANIFEST_BYTES,
     ]  # fmt: skip
 

@@ -14,7 +14,7 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.assembly import wheel_samples
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.sources import WheelSource
-from icrtool.logs.streams.wheels import travelled_by
+from icrtool.logs.streams.wheels import pose_travel
 from support.tables import table_of
 
 WIDTH_M, EVERY_S = 0.6, 0.05
@@ -95,7 +95,7 @@ def test_a_pose_that_stands_or_never_turns_is_not_the_wheels() -> None:
 def test_the_distance_of_an_arc_is_its_length() -> None:
     angle = np.linspace(0.0, 6.0, 25)
     zero = np.zeros(len(angle))
-    found = travelled_by(
+    found = pose_travel(
         2.0 * np.sin(angle), 2.0 * (1.0 - np.cos(angle)), zero, zero, np.sin(angle / 2), np.cos(angle / 2)
     )
     assert found is not None

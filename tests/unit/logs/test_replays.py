@@ -17,7 +17,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import read_log
 from icrtool.logs.streams.repeats import find_repeats, first_pass
-from icrtool.logs.streams.sources import StampedRows, as_replayed, stamp_rows
+from icrtool.logs.streams.sources import StampedRows, put_on_replay_clock, stamp_rows
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText
 
@@ -140,7 +140,7 @@ def test_a_stream_without_header_stamps_is_put_on_the_clock_of_a_replay() -> Non
     like = stamp_rows(table(header, (header - BEGIN_NS) // 2 + 2 * BEGIN_NS, header))
     assert like.far_ns is not None
     bare = np.arange(-SECOND_NS, 51 * SECOND_NS, SECOND_NS // 100)
-    moved = as_replayed(StampedRows(None, bare + 2 * BEGIN_NS, "no header", 0), like)
+    moved = put_on_replay_clock(StampedRows(None, bare + 2 * BEGIN_NS, "no header", 0), like)
     assert moved.header_ns is not None
     assert np.abs(moved.header_ns - (2 * bare + BEGIN_NS)).max() < 2_000_000
 

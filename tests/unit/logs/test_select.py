@@ -18,10 +18,10 @@ from icrtool.logs.streams.select import (
     Candidates,
     Choice,
     choose_streams,
-    fields_to_take,
     find_candidates,
     ignored_joints,
     other_references,
+    wanted_fields,
 )
 from icrtool.logs.streams.sources import StampedRows
 from icrtool.records.text import LogText
@@ -99,9 +99,9 @@ def channels_of(tables: Sequence[TopicTable]) -> list[Channel]:
 
 
 def find(tables: Sequence[TopicTable], *sets: str) -> Candidates:
-    """Read the tables that `fields_to_take` asks for, as reading a log does."""
+    """Read the tables that `wanted_fields` asks for, as reading a log does."""
     config = load_config(sets=sets)
-    wanted = fields_to_take(channels_of(tables), config)
+    wanted = wanted_fields(channels_of(tables), config)
     read = [replace(each, columns=dict(each.columns)) for i, each in enumerate(tables) if i in wanted]
     return find_candidates(read, config, {})
 
@@ -417,19 +417,19 @@ def test_a_configured_topic_is_used_in_spite_of_a_mere_doubt() -> None:
 
 def test_topics_that_no_role_needs_are_not_decoded() -> None:
     tables = [joints(), fix(), imu(), side("/temperature"), side("/left/speed"), side("/right/speed"), twist()]
-    names = {table.topic for i, table in enumerate(tables) if i in fields_to_take(channels_of(tables), load_config())}
+    names = {table.topic for i, table in enumerate(tables) if i in wanted_fields(channels_of(tables), load_config())}
     assert names == {"/joint_states", "/gps/fix", "/imu/data", "/left/speed", "/right/speed", "/cmd_vel"}
 
 
 def test_a_configured_topic_leaves_its_rivals_unread() -> None:
     tables = [joints(), joints("/other"), fix(), fix("/other/fix"), imu(), side("/left/speed"), side("/right/speed")]
     config = load_config(sets=["topics.wheels=/other", "topics.gnss=/gps/fix"])
-    names = {table.topic for i, table in enumerate(tables) if i in fields_to_take(channels_of(tables), config)}
+    names = {table.topic for i, table in enumerate(tables) if i in wanted_fields(channels_of(tables), config)}
     assert names == {"/other", "/gps/fix", "/imu/data"}
 
 
 def test_an_odometry_is_read_for_all_its_roles_at_once() -> None:
-    (paths,) = fields_to_take(channels_of([odometry()]), load_config()).values()
+    (paths,) = wanted_fields(channels_of([odometry()]), load_config()).values()
     assert {"twist.twist.linear.x", "pose.pose.position.x", "pose.pose.orientation.w"} <= set(paths)
     assert len(paths) == len(set(paths))
 

@@ -39,7 +39,7 @@ def test_parts_of_a_drive_that_a_clock_set_back_exchanges_are_one_warning_with_t
 
 
 def test_a_clock_set_back_by_more_is_refused() -> None:
-    with pytest.raises(DataError, match="times come again"):
+    with pytest.raises(DataError, match="the same times occur twice"):
         notes_of(set_back(5.0))
 
 

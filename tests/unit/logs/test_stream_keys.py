@@ -57,8 +57,8 @@ def test_headers_of_one_clock_in_all_streams_are_used_where_log_time_is_another(
     np.testing.assert_array_equal(log.gnss.stamp_ns, sim.stamp_ns[::4])
     np.testing.assert_array_equal(log.gyros[0].stamp_ns, sim.stamp_ns)
     assert any("one clock in all streams" in one for one in log.warnings)
-    by_log = read_log(path, load_config(sets=(*ROBOT, "topics.clock=log")))
-    assert by_log.wheels.stamp_ns[0] == WALL_NS
+    use_log_times = read_log(path, load_config(sets=(*ROBOT, "topics.clock=log")))
+    assert use_log_times.wheels.stamp_ns[0] == WALL_NS
 
 
 def test_headers_of_two_clocks_are_not_used_together(tmp_path: Path) -> None:

@@ -106,8 +106,8 @@ def test_a_single_link_is_a_pose_at_every_message(tmp_path: Path) -> None:
     ("messages", "reason"),
     [
         (odometry(), "its root, odom, does not show a position reference"),
-        (with_map(0), "its r1/map never moves against the odometry"),
-        (odometry(base="wheel"), "it moves none of the frames base_link"),
+        (with_map(0), "its frame r1/map never moves with respect to the odometry"),
+        (odometry(base="wheel"), "it has no transform of a frame base_link"),
     ],
     ids=["odometry alone", "a map that stands", "no base"],
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from icrtool.logs.streams.wheel_pairs import right_twin
+from icrtool.logs.streams.wheel_pairs import find_right_twin
 from icrtool.logs.streams.wheels import side_of, wheel_joints
 
 
@@ -82,9 +82,9 @@ def test_steering_joints_are_not_wheels() -> None:
     ],
 )
 def test_a_left_topic_has_its_right_twin(left: str, right: str) -> None:
-    assert right_twin(left, [left, "/lidar/speed", right]) == right
+    assert find_right_twin(left, [left, "/lidar/speed", right]) == right
 
 
 @pytest.mark.parametrize("name", ["/level", "/lidar/speed", "/battery_left", "/right_drive/velocity", "/load"])
 def test_a_topic_without_a_twin_has_none(name: str) -> None:
-    assert right_twin(name, [name, "/left_drive/velocity", "/temperature"]) is None
+    assert find_right_twin(name, [name, "/left_drive/velocity", "/temperature"]) is None

@@ -10,7 +10,7 @@ from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.assembly import wheel_samples
-from icrtool.logs.streams.sources import StampedRows, WheelSource, motion_of
+from icrtool.logs.streams.sources import StampedRows, WheelSource, make_wheel_source
 from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog
 from support.tables import read_source
@@ -23,7 +23,7 @@ NOTHING = PositionFixes(np.empty(0, np.int64), *(np.empty(0) for _ in range(5)))
 def speeds_of(left: Floats, right: Floats) -> tuple[Ints, Floats, Floats, list[str]]:
     stamps = STEP_NS * np.arange(len(left), dtype=np.int64)
     clock = StampedRows(None, stamps, "", 0)
-    motion = motion_of(topic="/wheels", message_type="some/Type", stamps=clock, position=(left, right))
+    motion = make_wheel_source(topic="/wheels", message_type="some/Type", stamps=clock, position=(left, right))
     raw, _ = wheel_samples(motion, stamps, CONFIG, "log")
     log = with_wheel_speeds(RobotLog("log", raw, NOTHING, NO_HEADINGS, None, (), (), {}, ()), CONFIG)
     return log.wheels.stamp_ns, log.wheels.v_left_mps, log.wheels.v_right_mps, list(log.warnings)
