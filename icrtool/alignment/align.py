@@ -97,13 +97,13 @@ def _with_size(found: Measurements, factor: float) -> Measurements:
     )
     scaled = {
         name: Finding(
-            None if one.value is None else factor * one.value,
-            None if one.std is None else factor * one.std,
-            factor * one.applied,
+            None if finding.value is None else factor * finding.value,
+            None if finding.std is None else factor * finding.std,
+            factor * finding.applied,
             "corrected",
         )
         for name in ("wheel_scale", "left_scale", "right_scale")
-        if (one := found.findings.get(name)) is not None
+        if (finding := found.findings.get(name)) is not None
     }
     return replace(found, wheels=wheels, findings={**found.findings, **scaled})
 
@@ -282,11 +282,11 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
         return log
     candidates = [(measure_agreement(other, config), other) for other in log.other_references]
     least = LEAST_SHARE_COVERED * chosen.distance_m
-    fit = [(one.residual_m, other) for one, other in candidates if one.distance_m > least]
-    residual, best = min(fit, key=lambda one: one[0], default=(math.inf, log))
+    fit = [(agreement.residual_m, other) for agreement, other in candidates if agreement.distance_m > least]
+    residual, best = min(fit, key=lambda candidate: candidate[0], default=(math.inf, log))
     if not residual < min(BETTER_RESIDUAL_RATIO * chosen.residual_m, POOR_M):
         return log
-    topics = [one.topic("gnss") for one in (best, log)]
+    topics = [candidate.topic("gnss") for candidate in (best, log)]
     against = f"{chosen.residual_m:.2f} m" if math.isfinite(chosen.residual_m) else "not comparable"
     why = f"agrees with wheels and heading within {residual:.2f} m over {LENGTH_M:.0f} m ({topics[1]}: {against})"
     streams = tuple(

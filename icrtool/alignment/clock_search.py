@@ -75,9 +75,9 @@ def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Con
     """
     frames = config.frames
     delays_s: dict[str, float] = {
-        key: float(one)
-        for key, one in (("reference_delay_s", frames.reference_delay_s), ("heading_delay_s", frames.heading_delay_s))
-        if one != "auto"
+        key: float(delay)
+        for key, delay in (("reference_delay_s", frames.reference_delay_s), ("heading_delay_s", frames.heading_delay_s))
+        if delay != "auto"
     }
     gnss, heading = (delays_s.get(key, 0.0) for key in ("reference_delay_s", "heading_delay_s"))
     heading = gnss if log.heading_is_of_position else heading
@@ -109,7 +109,7 @@ def _with_gyros_moved(log: RobotLog, by_s: Mapping[str, float]) -> RobotLog:
     def at(stamp_ns: Ints, topic: str) -> Ints:
         return stamp_ns - round(by_s.get(topic, 0.0) * 1e9)
 
-    gyros = tuple(replace(one, stamp_ns=at(one.stamp_ns, one.topic)) for one in log.gyros)
+    gyros = tuple(replace(gyro, stamp_ns=at(gyro.stamp_ns, gyro.topic)) for gyro in log.gyros)
     gyro = None if log.gyro is None else replace(log.gyro, stamp_ns=at(log.gyro.stamp_ns, log.gyro.topic))
     return replace(log, gyros=gyros, gyro=gyro)
 
@@ -137,8 +137,8 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
     if log.heading_is_of_position:
         shifts["heading"] = shifts["gnss"]
     if own is not None and config.frames.gyro_delay_s == "auto":
-        others = [one for one in log.gyros if one.topic != log.topic("heading")]
-        of_gyros = {one.topic: shift for one in others if (shift := find_shift(own, _Rates.of_gyro(one, log)))}
+        others = [gyro for gyro in log.gyros if gyro.topic != log.topic("heading")]
+        of_gyros = {gyro.topic: shift for gyro in others if (shift := find_shift(own, _Rates.of_gyro(gyro, log)))}
         notes += [note("clock_shifted", _sentence("gyro", shift, "gyro_delay_s")) for shift in of_gyros.values()]
         log = _with_gyros_moved(log, of_gyros) if of_gyros else log
     if not any(shifts.values()):
@@ -155,11 +155,11 @@ def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Findi
         "position_delay_against_heading_s": shifts.gnss - shifts.heading,
     }
 
-    def moved(one: Finding, shift: float) -> Finding:
-        value = None if one.value is None else one.value + shift
-        return replace(one, value=value, applied=one.applied + shift, why="corrected") if shift else one
+    def moved(finding: Finding, shift: float) -> Finding:
+        value = None if finding.value is None else finding.value + shift
+        return replace(finding, value=value, applied=finding.applied + shift, why="corrected") if shift else finding
 
-    return {name: moved(one, by.get(name, 0.0)) for name, one in findings.items()}
+    return {name: moved(finding, by.get(name, 0.0)) for name, finding in findings.items()}
 
 
 def _sentence(word: str, shift_s: float, key: str) -> str:
@@ -177,8 +177,8 @@ def _can_be_compared(log: RobotLog) -> bool:
     if min(len(wheels.stamp_ns), len(gnss.stamp_ns)) < 2:
         return False
     columns = (wheels.left, wheels.right, gnss.north_m, gnss.east_m, log.heading.heading_rad)
-    in_order = all((np.diff(one) >= 0).all() for one in (wheels.stamp_ns, gnss.stamp_ns, log.heading.stamp_ns))
-    return in_order and all(bool((np.abs(one) < IMPOSSIBLE_M).all()) for one in columns)
+    in_order = all((np.diff(stamps) >= 0).all() for stamps in (wheels.stamp_ns, gnss.stamp_ns, log.heading.stamp_ns))
+    return in_order and all(bool((np.abs(column) < IMPOSSIBLE_M).all()) for column in columns)
 
 
 class _Rates(NamedTuple):

@@ -224,10 +224,10 @@ def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -
     laid : (w,) mean of the sides' distances, and half their difference, along the heading of that handedness [m]
     """
     track, seen = windows.track, windows.seen / windows.length_m
-    v, u = (one / windows.length_m for one in laid)
+    v, u = (distances / windows.length_m for distances in laid)
     columns = np.column_stack([v, 1j * v, u, 1j * u])
     first, last = windows.turn_begin, windows.turn_end
-    turns = [track.cumulate(one) for one in (track.half_difference, track.mean_speed)]
+    turns = [track.cumulate(speed) for speed in (track.half_difference, track.mean_speed)]
     by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in turns]
     place, turn = (
         robust_regression(design, target, np.full(design.shape[1], VAGUE_PRIOR_STD), float(STARTS_A_WINDOW))

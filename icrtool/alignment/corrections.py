@@ -117,16 +117,16 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tupl
     heading = position = apart = UNKNOWN
     if fit is not None:
         found = (Delay(*fit.estimate(name)) for name in ("heading_delay", "position_delay"))
-        heading, position = (one if one.std_s < 2 * LARGEST_STD_S else UNKNOWN for one in found)
+        heading, position = (delay if delay.std_s < 2 * LARGEST_STD_S else UNKNOWN for delay in found)
         apart = Delay(*fit.estimate("position_after_heading"))
     together, notes, applied, lags = log.heading_is_of_position, list[Note](), (0.0, 0.0), [0.0, 0.0]
     if config.filter.rules.corrects:
         if fit is not None and not fit.slips:
             applied = _clear_delays(heading, position, apart, together=together)
         configured_s = config.frames.heading_delay_s, config.frames.reference_delay_s
-        shown = [one if one.is_significant else apart for one in (heading, position)]
-        free = [one == "auto" for one in configured_s]
-        notes = _delay_notes(applied, [one.std_s for one in shown], free, together=together)
+        shown = [delay if delay.is_significant else apart for delay in (heading, position)]
+        free = [delay == "auto" for delay in configured_s]
+        notes = _delay_notes(applied, [delay.std_s for delay in shown], free, together=together)
         lags = [own if lag == "auto" else lag for own, lag in zip(applied, configured_s, strict=True)]
     return StreamDelays(heading, position, apart, together, 0.0 if together else lags[0], lags[1]), notes
 
@@ -151,7 +151,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
         for first, second in free
         if all(value == 0.0 or _is_large(value) for value in (first, second))
     }
-    return min(costs, key=lambda one: costs[one])
+    return min(costs, key=lambda combination: costs[combination])
 
 
 def _is_large(delay_s: float) -> bool:

@@ -49,12 +49,14 @@ class GroundChanges(NamedTuple):
     @property
     def times_s(self) -> tuple[float, ...]:
         """Times of the changes, since the first wheel sample [s]."""
-        return tuple(one.begin_s for one in self.stretches[1:])
+        return tuple(stretch.begin_s for stretch in self.stretches[1:])
 
     @property
     def text(self) -> str:
         """The finding for the user: times and multipliers of the changes, and the options to set."""
-        values = _joined([f"{one.multiplier:.3f} ± {max(one.multiplier_std, 0.001):.3f}" for one in self.stretches])
+        values = _joined(
+            [f"{stretch.multiplier:.3f} ± {max(stretch.multiplier_std, 0.001):.3f}" for stretch in self.stretches]
+        )
         when = _joined([f"{t:.0f} s" for t in self.times_s])
         options = " ".join(f"--terrain-change {t:.0f}" for t in self.times_s)
         where, fits, states = ("before and after", "neither", "states it")
@@ -142,7 +144,7 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
     ----------
     places : (p,) rows at which a stretch may begin or end, ascending
     """
-    sums = [np.append(0.0, np.cumsum(one))[places] for one in (turns.x**2, turns.x * turns.y, turns.y**2)]
+    sums = [np.append(0.0, np.cumsum(products))[places] for products in (turns.x**2, turns.x * turns.y, turns.y**2)]
     groups = np.searchsorted(np.unique(turns.group), turns.group)
     enough = np.append(groups, groups[-1] + 1)[places]
 
@@ -157,8 +159,8 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
     for changes in range(MOST_CHANGES + 1):
         if changes:
             by_first = [best[:stop] + remaining(np.arange(stop), stop) for stop in range(1, count)]
-            best_before.append(np.array([0, *(int(np.argmin(one)) for one in by_first)]))
-            best = np.array([np.inf, *(float(one.min()) for one in by_first)])
+            best_before.append(np.array([0, *(int(np.argmin(costs)) for costs in by_first)]))
+            best = np.array([np.inf, *(float(costs.min()) for costs in by_first)])
         if not math.isfinite(best[-1]):
             break
         at, rows = count - 1, [count - 1]
@@ -172,7 +174,7 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
 
 def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
     """Return rows that divide the windows, each moved to the smallest sum of squares between its neighbours."""
-    xx, xy, yy = (np.append(0.0, np.cumsum(one)) for one in (turns.x**2, turns.x * turns.y, turns.y**2))
+    xx, xy, yy = (np.append(0.0, np.cumsum(products)) for products in (turns.x**2, turns.x * turns.y, turns.y**2))
 
     def remaining(first: Ints | int, stop: Ints | int) -> Floats:
         square = np.maximum(xx[stop] - xx[first], 1e-12)

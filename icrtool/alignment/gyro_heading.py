@@ -222,7 +222,7 @@ class _Problem:
     ) -> None:
         self.turn, self.absolute, self.G = turn, absolute, turn.integrated
         still_t, still_rate = still
-        t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
+        t = np.concatenate([courses.end, still_t, *(sensor.t for sensor in absolute)])
         # Events without a measurement fill long gaps between events.
         at = np.sort(t)
         far = np.flatnonzero(np.diff(at) > 2.0 * LONGEST_GYRO_STEP_S)
@@ -234,7 +234,7 @@ class _Problem:
         t = np.concatenate([t, *steps])
         kind = np.repeat(
             [COURSE, STANDSTILL, *range(ABSOLUTE, ABSOLUTE + len(absolute)), NOTHING],
-            [len(courses.end), len(still_t), *(len(one.t) for one in absolute), len(nothing)],
+            [len(courses.end), len(still_t), *(len(sensor.t) for sensor in absolute), len(nothing)],
         )
         order = np.lexsort((kind, t))
         h = np.zeros((len(t), GYRO_STATES + STATES_OF_A_SOURCE * len(absolute)))
@@ -244,12 +244,17 @@ class _Problem:
         h[rows, BIAS], h[rows, SCALE], h[rows, X], h[rows, DELAY] = (
             courses.of_bias, courses.of_scale, courses.of_x, courses.of_delay,
         )  # fmt: skip
-        for i, one in enumerate(absolute):
+        for i, sensor in enumerate(absolute):
             rows, first = kind == ABSOLUTE + i, STATES_OF_A_SOURCE * i
             h[rows, first + OFFSET] = h[rows, first + WANDER] = 1.0
-            h[rows, first + LAG] = -one.rate
-        z = np.concatenate([courses.angle, still_rate, *(one.heading for one in absolute), nothing])
-        std = [courses.std, np.full(len(still_t), STANDING_RATE_STD), *(one.std for one in absolute), nothing + 1.0]
+            h[rows, first + LAG] = -sensor.rate
+        z = np.concatenate([courses.angle, still_rate, *(sensor.heading for sensor in absolute), nothing])
+        std = [
+            courses.std,
+            np.full(len(still_t), STANDING_RATE_STD),
+            *(sensor.std for sensor in absolute),
+            nothing + 1.0,
+        ]
         self.t, self.kind, h = t[order], kind[order], h[order]
         self.at = np.interp(self.t, turn.t, self.G)
         elapsed, turned = (np.diff(column, prepend=column[:1]) for column in (self.t, self.at))
@@ -306,7 +311,7 @@ class _Problem:
             before = noises
             for name, values in grids.items():
                 tried = (noises | {name: float(value)} for value in values)
-                noises = max(tried, key=lambda one: likelihood(*one.values()))
+                noises = max(tried, key=lambda noise: likelihood(*noise.values()))
             if noises == before:
                 break
         return noises

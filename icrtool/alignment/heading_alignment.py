@@ -177,7 +177,9 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
     if not moved.any():
         return NOT_COMPARED
     # with a heading of the other handedness the displacement is mirrored about north
-    angle, turned_over = (np.exp(1j * np.angle(one * np.conj(seen)))[moved] for one in (laid, np.conj(laid)))
+    angle, turned_over = (
+        np.exp(1j * np.angle(distances * np.conj(seen)))[moved] for distances in (laid, np.conj(laid))
+    )
     backwards = (gone < 0.0)[moved]
     ahead, back = angle[~backwards], angle[backwards]
     turns_about = False
@@ -226,7 +228,7 @@ def align_heading(
         offset, std = attitude
         applied = offset
         text, name = _offset_in_words(log, offset, std, mirrored=mirrored)
-        notes = [one for one in notes if one.code in OF_THE_SENSE]
+        notes = [finding for finding in notes if finding.code in OF_THE_SENSE]
         if not notes and _significant(offset, std):
             notes = [_offset_note(text, offset)]
     elif derived is not None:

@@ -137,7 +137,7 @@ class DerivedHeading:
         heading = self.causal
         rate = 1e9 / float(np.median(np.diff(heading.stamp_ns)))
         stream = StreamChoice("heading", self.topic, "estimated", len(heading.stamp_ns), rate, "header", 0.0, self.why)
-        streams = (*(one for one in log.streams if one.role != "heading"), stream)
+        streams = (*(choice for choice in log.streams if choice.role != "heading"), stream)
         return replace(log, heading=heading, streams=streams, gyro=self.gyro if self.gyro is not None else log.gyro)
 
 
@@ -251,8 +251,8 @@ def _derived(
     if estimate is None:
         return None
     bias = f"turn rate (bias {math.degrees(estimate.constants[1]):+z.2f} deg/s at the end)"
-    parts = [*(one.part for one in absolute), bias if gyro_topic else f"wheels ({instead})", "course over ground"]
-    names = [*(one.topic for one in absolute), gyro_topic or "wheels", log.topic("gnss", "positions")]
+    parts = [*(sensor.part for sensor in absolute), bias if gyro_topic else f"wheels ({instead})", "course over ground"]
+    names = [*(sensor.topic for sensor in absolute), gyro_topic or "wheels", log.topic("gnss", "positions")]
     source = "gyro_course" if gyro_topic else "wheels_course"
     if bearing is not None:
         source = "antenna_pair"
@@ -336,7 +336,7 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
 
 def without_heading(log: RobotLog, why: str) -> RobotLog:
     """Return the log without its heading, so that a heading is estimated; `why` is reported."""
-    streams = tuple(one for one in log.streams if one.role != "heading")
+    streams = tuple(stream for stream in log.streams if stream.role != "heading")
     return replace(
         log, heading=NO_HEADINGS, streams=streams, notes=(*log.notes, note("heading_left_out", why, log.name))
     )

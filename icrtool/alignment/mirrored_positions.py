@@ -65,17 +65,17 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
     ):
         return log
     candidates = []
-    for words, one in _exchanges(log):
-        fixes = one.gnss
+    for words, candidate in _exchanges(log):
+        fixes = candidate.gnss
         track = windows.track._replace(north=fixes.north_m, east=fixes.east_m)
-        candidates.append((NamedFit.of(replace(windows, track=track)), words, one))
+        candidates.append((NamedFit.of(replace(windows, track=track)), words, candidate))
     scatter = min((fit.scatter for fit, _, _ in candidates), default=0.0)
     scatter = max(scatter, 0.5 * windows.track.place_std_m / float(windows.length_m[0]))
     costs = [fit.cost(scatter) for fit, _, _ in candidates]
     gain = as_sent.cost(scatter) - min(costs, default=math.inf)
     if not gain > DECISIVE:
         return log
-    near = [one for one, cost in zip(candidates, costs, strict=True) if cost < min(costs) + DECISIVE]
+    near = [candidate for candidate, cost in zip(candidates, costs, strict=True) if cost < min(costs) + DECISIVE]
     if by_gyro:
         # Without a heading nothing decides between exchanges that fit equally well: their paths differ by a turn.
         what, right = " or ".join(words for _, words, _ in near), near[0][2]
@@ -83,7 +83,7 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
         what += " (or the gyro is upside down, and the sides are exchanged)"
     else:
         # The offset of the heading decides between exchanges that fit equally well.
-        _, what, right = min(near, key=lambda one: abs(one[0].offset_rad))
+        _, what, right = min(near, key=lambda candidate: abs(candidate[0].offset_rad))
         witnesses = "gyro, heading and wheels, which agree"
     why = (
         f"the positions turn in the opposite sense to {witnesses}: {what}; corrected "
@@ -108,7 +108,8 @@ def _exchanged_by_distance(log: RobotLog, named: RobotLog) -> RobotLog:
         return log
     wheels = named.wheels
     sent, back = (
-        reference_scale(wheels.stamp_ns, wheels.v_left_mps, wheels.v_right_mps, one.gnss) for one in (named, other)
+        reference_scale(wheels.stamp_ns, wheels.v_left_mps, wheels.v_right_mps, candidate.gnss)
+        for candidate in (named, other)
     )
     if sent is None or back is None or not min(sent.value, sent.std, back.value, back.std) > 0.0:
         return log
@@ -150,26 +151,26 @@ def _exchanges(log: RobotLog) -> list[tuple[str, RobotLog]]:
         mirrored = replace(log.gnss, east_m=-log.gnss.east_m, cov_north_east_m2=-log.gnss.cov_north_east_m2)
         return [("two axes are exchanged, or one has the other sign", replace(log, gnss=mirrored))]
     tried = ((words, exchange(log, log.datum)) for words, exchange in EXCHANGES)
-    return [(words, one) for words, one in tried if one is not None]
+    return [(words, candidate) for words, candidate in tried if candidate is not None]
 
 
 def _exchanged(log: RobotLog, datum: Datum, exchange: Callable[[PositionFixes], PositionFixes]) -> RobotLog:
     """Return a log with another datum and exchanged positions of all its receivers."""
-    others = tuple(replace(one, fixes=exchange(one.fixes)) for one in log.other_receivers)
+    others = tuple(replace(receiver, fixes=exchange(receiver.fixes)) for receiver in log.other_receivers)
     return replace(log, datum=datum, gnss=exchange(log.gnss), other_receivers=others)
 
 
 def _other_longitude(log: RobotLog, datum: Datum) -> RobotLog | None:
     return _exchanged(
         log, replace(datum, longitude_deg=-datum.longitude_deg),
-        lambda one: replace(one, east_m=-one.east_m, cov_north_east_m2=-one.cov_north_east_m2),
+        lambda fixes: replace(fixes, east_m=-fixes.east_m, cov_north_east_m2=-fixes.cov_north_east_m2),
     )  # fmt: skip
 
 
 def _other_latitude(log: RobotLog, datum: Datum) -> RobotLog | None:
     return _exchanged(
         log, replace(datum, latitude_deg=-datum.latitude_deg),
-        lambda one: replace(one, north_m=-one.north_m, cov_north_east_m2=-one.cov_north_east_m2),
+        lambda fixes: replace(fixes, north_m=-fixes.north_m, cov_north_east_m2=-fixes.cov_north_east_m2),
     )  # fmt: skip
 
 
@@ -182,9 +183,9 @@ def _both_exchanged(log: RobotLog, datum: Datum) -> RobotLog | None:
     north, east = to_north / of_east, to_east / of_north
     return _exchanged(
         log, Datum(datum.longitude_deg, datum.latitude_deg, datum.height_m),
-        lambda one: replace(
-            one, north_m=north * one.east_m, east_m=east * one.north_m, var_north_m2=north**2 * one.var_east_m2,
-            var_east_m2=east**2 * one.var_north_m2, cov_north_east_m2=north * east * one.cov_north_east_m2,
+        lambda fixes: replace(
+            fixes, north_m=north * fixes.east_m, east_m=east * fixes.north_m, var_north_m2=north**2 * fixes.var_east_m2,
+            var_east_m2=east**2 * fixes.var_north_m2, cov_north_east_m2=north * east * fixes.cov_north_east_m2,
         ),
     )  # fmt: skip
 

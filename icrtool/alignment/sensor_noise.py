@@ -156,7 +156,7 @@ def without_bad_start(log: RobotLog) -> RobotLog:
     gnss, wheels = log.gnss, log.wheels
     if len(gnss.stamp_ns) < 4 * FIRST_FIXES or len(wheels.stamp_ns) < 2:
         return log
-    if not all(np.isfinite(one).all() for one in (gnss.north_m, gnss.east_m, wheels.left, wheels.right)):
+    if not all(np.isfinite(column).all() for column in (gnss.north_m, gnss.east_m, wheels.left, wheels.right)):
         # refused later
         return log
     seconds = np.diff(gnss.stamp_ns[: 4 * FIRST_FIXES]) / 1e9
@@ -278,7 +278,7 @@ def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn
     """
     free = settings.rules.measures_noise and settings.gnss_std_m == "auto" and log.datum is None
     place_stated, turn_stated = (
-        (np.isfinite(one) & (one > 0.0)).any() for one in (log.gnss.var_north_m2, log.heading.var_rad2)
+        (np.isfinite(variance) & (variance > 0.0)).any() for variance in (log.gnss.var_north_m2, log.heading.var_rad2)
     )
     if not free or place_stated:
         return math.nan, math.nan

@@ -208,8 +208,8 @@ def _weigh(
         least = np.where(_of_one_side(moving) & drives, LEAST_OF_SIDE, LEAST_SHARE)
         shows = (square > LEAST_DISTANCE2) & (np.sqrt(missed2.sum(axis=1)) > least * moving.path_m)
         shown.append((moving.rows(shows), square[shows]))
-    windows = ComparedWindows._make(map(np.concatenate, zip(*(one for one, _ in shown), strict=True)))
-    square, beyond = np.concatenate([one for _, one in shown]), _exceeds(windows)
+    windows = ComparedWindows._make(map(np.concatenate, zip(*(compared for compared, _ in shown), strict=True)))
+    square, beyond = np.concatenate([square_of_part for _, square_of_part in shown]), _exceeds(windows)
     # a robot that stands still is rarer than slip, and so is its opposite: twice the motion of the wheels
     doubled = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
     doubled = np.maximum(doubled, np.abs(windows.turned - windows.model_turned))
@@ -349,9 +349,9 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
         """Return the part of a step that lies in the event [s]; a default where the fixes are too noisy to show it."""
         if not 0 <= row < len(usable) or not usable[row]:
             return 0.0
-        one = steps.rows(slice(row, row + 1))
-        deviation = np.sqrt(np.maximum(one.sensor + (error * one.path_m) ** 2, NO_VARIANCE))[0]
-        expected, seen = _expected(one, shares)[0] / deviation, one.residual[0] / deviation
+        step = steps.rows(slice(row, row + 1))
+        deviation = np.sqrt(np.maximum(step.sensor + (error * step.path_m) ** 2, NO_VARIANCE))[0]
+        expected, seen = _expected(step, shares)[0] / deviation, step.residual[0] / deviation
         size2 = float(expected @ expected)
         part = float(np.clip(expected @ seen / size2, 0.0, 1.0)) if size2 > CLEAR_STEP**2 else default
         return part * float(t[row + 1] - t[row])

@@ -211,8 +211,8 @@ def without_interpolated(log: RobotLog) -> RobotLog:
     if len(stamps) < FEWEST_IN_CURVES or len(wheels.stamp_ns) < 2:
         return log
     columns = fixes.north_m, fixes.east_m, wheels.left, wheels.right, log.heading.heading_rad
-    in_order = all((np.diff(one.stamp_ns) >= 0).all() for one in (fixes, wheels, log.heading))
-    if not in_order or not all((np.abs(one) < LARGEST_STATE).all() for one in columns):
+    in_order = all((np.diff(stream.stamp_ns) >= 0).all() for stream in (fixes, wheels, log.heading))
+    if not in_order or not all((np.abs(column) < LARGEST_STATE).all() for column in columns):
         # Damaged streams are refused later, with the reason.
         return log
     t, place = (stamps - stamps[0]) / 1e9, fixes.north_m + 1j * fixes.east_m

@@ -177,7 +177,7 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     usable &= np.abs(laid_path[end] - laid_path[begin]) > 0.5 * length * (count - 1) / count
     usable &= track.clear(t[begin], t[end])
     usable &= np.searchsorted(turn.holes[:, 1], t[begin]) == np.searchsorted(turn.holes[:, 0], t[end])
-    of_x, of_delay = (product(centred(-one)).imag / square for one in (swing, speed * swing))
+    of_x, of_delay = (product(centred(-signal)).imag / square for signal in (swing, speed * swing))
     of_bias = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
     of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
     chord = laid_path[end] - laid_path[begin]

@@ -231,7 +231,9 @@ def unexplained_turn_variance(fit: AlignmentFit) -> tuple[float, float]:
     """
     residuals = residuals_by_estimate(fit)
     groups, row = np.unique(fit.windows.turn_group, return_inverse=True)
-    unexplained, turned = (np.bincount(row, one**2, len(groups)) for one in (residuals.turn_after, residuals.turn_rad))
+    unexplained, turned = (
+        np.bincount(row, turns**2, len(groups)) for turns in (residuals.turn_after, residuals.turn_rad)
+    )
     if len(groups) < 2 or not (turned > 0.0).sum() >= 2:
         return math.nan, math.nan
     without = (unexplained.sum() - unexplained) / (turned.sum() - turned)
@@ -299,7 +301,7 @@ def _fused_note(log: RobotLog, width_m: float | None) -> list[Note]:
     The turn of a copy is 1.00 of the gyro's turn, and a copy has the gyro's noise. The turn of wheels that slip by 1 %
     is 1.01 of the gyro's turn. `width_m` is the width that the body twist was converted with.
     """
-    stream = next((one for one in log.streams if one.is_twist), None)
+    stream = next((choice for choice in log.streams if choice.is_twist), None)
     if stream is None or log.gyro is None or width_m is None:
         return []
     t = (log.wheels.stamp_ns - log.gyro.stamp_ns[0]) / 1e9
@@ -422,7 +424,9 @@ def find_filtering(fit: AlignmentFit) -> str:
     if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(EVIDENCE_SIGMAS * std, SMALLEST_CHANGE * long.ratio):
         ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {short_s:g} s and {long.ratio:.2f} ± "
         return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of the turn that they show"
-    at_middle, at_end = (math.sqrt(max(one.residual_rad**2 - noise.residual_rad**2, 0.0)) for one in (middle, long))
+    at_middle, at_end = (
+        math.sqrt(max(residual.residual_rad**2 - noise.residual_rad**2, 0.0)) for residual in (middle, long)
+    )
     least = max(LARGE_SHARE * short.turn_rad, LARGE_RAD)
     if at_middle > least and at_end < BOUNDED * at_middle:
         angles = f"{math.degrees(at_middle):.0f}° over {middle_s:g} s and by no more than {math.degrees(at_end):.0f}°"

@@ -154,7 +154,7 @@ def with_right_size(log: RobotLog, config: Config) -> tuple[RobotLog, float]:
     wheels, settings = log.wheels, config.wheels
     if settings.left_scale != "auto" or settings.right_scale != "auto":
         return log, 1.0
-    if not all(np.isfinite(one).all() for one in (log.gnss.north_m, log.gnss.east_m, wheels.left, wheels.right)):
+    if not all(np.isfinite(column).all() for column in (log.gnss.north_m, log.gnss.east_m, wheels.left, wheels.right)):
         # refused later
         return log, 1.0
     scale = reference_scale(wheels.stamp_ns, wheels.v_left_mps, wheels.v_right_mps, log.gnss)
@@ -191,11 +191,15 @@ def wrong_size(scale: Scale, log: RobotLog, config: Config) -> Note | None:
 def radius_hint(log: RobotLog, config: Config, scale: float) -> str:
     """Return a text on the wheel radius that the log shows; "check " where the wheel speeds need no radius."""
     robot, radius_m = config.robot.name, config.robot.wheel_radius_m
-    by_radius = any(one.role == "wheels" and _ANGLES.search(one.why) for one in log.streams)
+    by_radius = any(choice.role == "wheels" and _ANGLES.search(choice.why) for choice in log.streams)
     if radius_m is None or not by_radius:
         return "check "
-    of_robot = radius_m == builtin_robots().get(robot or "", {}).get("wheel_radius_m")
-    given = f"{robot} has {radius_m:g} m: is --robot right?" if of_robot else f"robot.wheel_radius_m is {radius_m:g} m:"
+    is_robots_radius = radius_m == builtin_robots().get(robot or "", {}).get("wheel_radius_m")
+    given = (
+        f"{robot} has {radius_m:g} m: is --robot right?"
+        if is_robots_radius
+        else f"robot.wheel_radius_m is {radius_m:g} m:"
+    )
     return f"the log shows a wheel radius of {scale * radius_m:.3f} m, {given} check "
 
 

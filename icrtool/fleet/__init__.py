@@ -1,1 +1,1 @@
-"""Batches of many logs: find the recordings, process each log in a separate process, and collect a row for each."""
+"""Batches of many logs: recordings are found, each log is processed in a separate process and gets a row."""

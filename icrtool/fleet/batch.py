@@ -1,4 +1,4 @@
-"""Run a batch: pass logs to an executor, skip finished logs, retry logs whose process died, yield a row for each."""
+"""Running of a batch: finished logs are skipped, the others processed by an executor, and failed processes repeated."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from icrtool.config import builtin_robots
 from icrtool.dropout_analysis.report import parse_gate
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
-from icrtool.fleet.one_log import files_of, path_from_bytes, row_of_failure
-from icrtool.fleet.processes import Lost, close_all, process_apart
+from icrtool.fleet.one_log import hashed_files, path_from_bytes, row_of_failure
+from icrtool.fleet.processes import LossReason, close_all, process_apart
 from icrtool.fleet.recordings import (
     FoundRecording,
     ManifestEntry,
@@ -55,8 +55,10 @@ def plan_requests(
 
     Parameters
     ----------
-    output : folder of the results
-    folder : folder on disk that is used where `output` is an address
+    places : logs, folders with logs, and manifests
+    output : folder or address of the results
+    batch : request for all logs
+    folder : folder of the results on disk if `output` is an address
 
     Raises
     ------
@@ -69,7 +71,7 @@ def plan_requests(
     """
     gates = [parse_gate(gate) for gate in batch.report.gates]
     _check_output(output, folder or output, batch)
-    # A pattern of the shell may also name tables of simulated truth next to their logs, which are no manifests.
+    # A pattern of the shell may also match tables of simulated truth next to their logs, which are no manifests.
     other_files = logs_among([place for place in places if place.is_file()])[1]
     places = [place for place in places if place not in other_files]
     entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]
@@ -85,18 +87,23 @@ def plan_requests(
     ]
     if baseline is not None and any(gate.relative for gate in gates):
         baseline.check_compares(
-            (one.known.log, _content_of(path_from_bytes(one.path), baseline), one.known.robot, one.known.group)
-            for one in requests
+            (
+                request.known.log,
+                _content_of(path_from_bytes(request.path), baseline),
+                request.known.robot,
+                request.known.group,
+            )
+            for request in requests
         )
     return requests
 
 
 def _check_output(output: Path, folder: Path, batch: BatchRequest) -> None:
-    """Refuse a folder of results that a batch cannot write to; `folder` is the folder on disk."""
+    """Refuse a folder of results in which a batch would replace other files; raise `OutputError`."""
     if (folder / RUN_FILE).is_file():
-        raise OutputError(output, "is a run itself", "name another place for the batch")
+        raise OutputError(output, "is the directory of a run", "name another folder for the batch")
     if folder.exists() and not folder.is_dir():
-        raise OutputError(output, "a file is there", "name another place for the batch")
+        raise OutputError(output, "is a file", "name another folder for the batch")
     check_tables(folder, page=batch.files.page)
 
 
@@ -107,7 +114,8 @@ def _open_baseline(batch: BatchRequest, output: Path) -> Baseline | None:
     from icrtool.output.dropout_directory import open_baseline
 
     if batch.baseline.resolve() == output.resolve():
-        raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")
+        why = "is the folder to which the batch writes"
+        raise ConfigError(f"--baseline {output}", why, "copy the baseline, or name another folder with -o")
     return open_baseline(batch.baseline)
 
 
@@ -131,18 +139,19 @@ def _request_for(
         raise ConfigError(f"{recording.log}: robot {about.robot!r}", "not a built-in robot", advice)
     robot = about.robot if builtin else settings.robot if not about.robot else None
     config = settings._replace(file=about.config or settings.file, robot=robot).load()
-    # The key does not depend on whether a page is asked for: `find_finished_row` looks for the file report.html.
+    # The key does not depend on the page, because `find_finished_row` checks whether the file report.html exists.
     files = replace(batch.files, page=True, overwrite=False)
     # The name of the row in the report contains the stem of the file.
     named_calibrations = [
-        (as_text(file.stem), one.sha256) for file, one in zip(batch.calibrations, calibrations, strict=True)
+        (as_text(file.stem), calibration.sha256)
+        for file, calibration in zip(batch.calibrations, calibrations, strict=True)
     ]
     keyed = [config.effective(), __version__, batch.report, files, about.robot, baseline, *named_calibrations]
     row = FleetLog(
         recording.log, f"{RUNS}/{recording.name}", "failed", robot=about.robot or config.robot.name or "",
         group=about.group, tags=about.tags, key=sha256(msgspec.json.encode(keyed, order="sorted")).hexdigest(),
     )  # fmt: skip
-    # Workers of a cluster may have another working directory.
+    # Paths are absolute, because workers of a cluster may have another working directory.
     return LogRequest(
         path=os.fsencode(recording.path.absolute()), known=row, folder=os.fsencode(output.absolute()),
         config=config, report=batch.report, files=batch.files, calibrations=calibrations,
@@ -151,7 +160,7 @@ def _request_for(
 
 
 def _content_of(path: Path, baseline: Baseline) -> tuple[str, ...]:
-    """Return the SHA-256 of each file of a log; empty where no log of the baseline can have the same content."""
+    """Return the SHA-256 of each file of a log; empty if no log of the baseline can have the same content."""
     if isinstance(path, UrlPath) or not any(baseline.sha256.values()):
         return ()
     return tuple(file_sha256(file) for file in files_of_log(path))
@@ -160,7 +169,8 @@ def _content_of(path: Path, baseline: Baseline) -> tuple[str, ...]:
 def find_finished_row(request: LogRequest, folder: Path) -> FleetLog | None:
     """Return the row of a log that an earlier batch processed with the same input, configuration and version.
 
-    A log whose content makes it fail counts as processed, because it would fail again.
+    None is returned for any other log. A log that failed because of its content counts as processed, because it would
+    fail again.
 
     Parameters
     ----------
@@ -181,16 +191,17 @@ def find_finished_row(request: LogRequest, folder: Path) -> FleetLog | None:
 
 def run_batch(
     requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: WatchLog | None = None,
-    lost: Lost = str, folder: Path | None = None,
+    lost: LossReason = str, folder: Path | None = None,
 ) -> Generator[FleetLog, None, None]:  # fmt: skip
     """Yield the row of each log when it is done; logs whose process died or hung are tried once more at the end.
 
     Parameters
     ----------
+    requests : results of `plan_requests`
     executor : executor that calls `process_apart`, in threads on this machine or in workers of a cluster
-    watch : called with the next stage of a log, if the executor is on this machine
-    lost : returns why the executor can process no log any more; empty while it can
-    folder : folder on disk that is used where the results go to an address
+    watch : called with log and stage when a stage begins, if the executor is on this machine
+    lost : returns the reason why the executor can process no more logs; empty while it can
+    folder : folder of the results on disk if they go to an address
     """
     todo: list[LogRequest] = []
     for request in requests:
@@ -200,7 +211,7 @@ def run_batch(
         else:
             todo.append(request)
     again: list[LogRequest] = []
-    for request, row in _all_of(todo, executor, batch, watch, lost):
+    for request, row in _process_requests(todo, executor, batch, watch, lost):
         if row.status == "failed" and not row.repeatable:
             again.append(request)
             if watch is not None:
@@ -208,14 +219,15 @@ def run_batch(
         else:
             yield row
     for request in again:
-        # One log at a time: a log that lacked memory while other logs were processed may have enough memory alone.
-        for _, row in _all_of([request], executor, batch, watch, lost):
+        # The logs are processed one at a time. A log that lacked memory beside other logs may have enough alone.
+        for _, row in _process_requests([request], executor, batch, watch, lost):
             yield replace(row, reason=f"{row.reason} (tried twice)") if row.status == "failed" else row
 
 
-def _all_of(
-    requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: WatchLog | None, lost: Lost
+def _process_requests(
+    requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: WatchLog | None, lost: LossReason
 ) -> Generator[tuple[LogRequest, FleetLog], None, None]:
+    """Yield each request with the row of its log when it is done; arguments as `run_batch`."""
     pending: dict[Future[FleetLog], LogRequest] = {}
     try:
         for request in requests:
@@ -247,7 +259,7 @@ def _all_of(
 
 
 def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
-    """Return whether the files of a log are as in an earlier batch; content is compared where times differ."""
+    """Return whether the files of a log are unchanged since an earlier batch; content decides if their times differ."""
     if isinstance(path, UrlPath):
         return bool(stored) and _is_unchanged(stored[0], path)
     try:
@@ -257,7 +269,7 @@ def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
         for file, before in zip(files, stored, strict=True):
             status = file.stat()
             same_time = status.st_mtime_ns == before.mtime_ns
-            if status.st_size != before.bytes or not (same_time or files_of(file)[0].sha256 == before.sha256):
+            if status.st_size != before.bytes or not (same_time or hashed_files(file)[0].sha256 == before.sha256):
                 return False
     except OSError:
         return False

@@ -1,6 +1,6 @@
-"""Files that a batch writes: tables, figures, results of acceptance limits for CI, and calibrations.
+"""Files of a batch: tables, figures, results of acceptance limits for CI, and calibrations.
 
-There is one calibration per robot and group. It is tested by leaving out each log in turn.
+There is one calibration for each robot and group. It is tested by leaving out each log in turn.
 """
 
 from __future__ import annotations
@@ -37,11 +37,14 @@ AFTER_ERRORS = ("events", "outages", "warnings", "tool_version", "run")
 """Columns of fleet.csv that are fields of a log's row, before and after the columns of ICRs and errors."""
 
 WITHIN, IS_BOUND = "_within_", "_is_bound"
-"""Parts of column names: of a distance within a budget [m], and of its column that is 1 for a lower bound, else 0."""
+"""Parts of the names of two columns: the distance within a budget [m], and 1 if this distance is a lower bound, else
+0."""
 
 FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
+"""Columns of failures.csv."""
 
 PLOTS = "plots"
+"""Folder of the figures, below the folder of the batch."""
 
 CALIBRATIONS = "calibrations"
 """Folder of the calibration files, below the folder of the batch."""
@@ -54,22 +57,23 @@ FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
 """Names of the folders that a batch writes."""
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", FLEET_FILE)
+"""Names of the tables of a batch."""
 
 SHOWN_ERRORS = {MAIN_ROW: documents.SHOWN_ERROR, FALLBACK_ROW: documents.SHOWN_FALLBACK}
-"""Columns of errors that the picture can show, by row. The picture shows the first row that any log has."""
+"""Columns of errors that the figure can show, by row. It shows the first one that a log has."""
 
 
 def check_tables(folder: Path, *, page: bool) -> None:
-    """Refuse a folder in which a file that icrtool did not write has the name of a result, before any work is done.
+    """Refuse a folder in which a file that icrtool did not write has the name of a result.
 
     Parameters
     ----------
-    page : a page is written too
+    page : whether the batch writes a page
 
     Raises
     ------
     OutputError
-        There is such a file.
+        The folder contains such a file.
     """
     if page and folder.is_dir():
         check_place(Below(folder, PAGE_FILE), is_page)
@@ -78,7 +82,7 @@ def check_tables(folder: Path, *, page: bool) -> None:
         return
     for file in (*(folder / name for name in TABLES), *pictures_of_batch(folder)):
         if file.exists() and not file.is_symlink():
-            raise OutputError(file, "a file that no batch wrote is there", "it is left alone; name another folder")
+            raise OutputError(file, "exists and was not written by a batch", "it is not replaced; name another folder")
 
 
 def pictures_of_batch(folder: Path) -> list[Path]:
@@ -106,7 +110,7 @@ def fleet_rows(rows: Sequence[FleetLog]) -> list[dict[str, object]]:
     table = []
     for row in rows:
         cells: dict[str, object] = {name: getattr(row, name) for name in BEFORE_ICRS}
-        cells |= {name: row.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{one}" for one in ICR_COLUMNS))}
+        cells |= {name: row.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{column}" for column in ICR_COLUMNS))}
         cells |= {"multiplier": row.multiplier, "multiplier_std": row.multiplier_std}
         for name in errors:
             cells[name] = row.errors.get(name)
@@ -132,13 +136,14 @@ def write_fleet(
 
     Parameters
     ----------
+    directory : folder of the batch
     plots : formats of the figures
-    page : write report.html
+    page : whether to write report.html
 
     Raises
     ------
     OutputError
-        The files cannot be written to the disk.
+        A file cannot be written.
     """
     cells = fleet_rows(rows)
     write_file(Below(directory, "fleet.csv"), formats.csv_bytes(cells[0], (row.values() for row in cells)))
@@ -149,7 +154,7 @@ def write_fleet(
     if plots:
         write_figures(rows, directory, plots)
     document = fleet_document(rows, calibrations)
-    # fleet.json is written after the tables: where it exists, the tables are from the same batch.
+    # fleet.json is written after the tables, so that existing tables are of the same batch as fleet.json.
     write_file(Below(directory, FLEET_FILE), formats.json_bytes(document))
     if page:
         from icrtool.output.page.pages import fleet_page
@@ -159,35 +164,39 @@ def write_fleet(
 
 
 def calibrations_text(calibrations: Sequence[FleetCalibration]) -> str:
-    """Return the pooled calibrations, one line each."""
+    """Return a text with one paragraph for each calibration."""
     parts = []
-    for one in calibrations:
-        name = ", ".join(str(LogText(part)) for part in (one.robot, one.group) if part) or "all logs"
-        head = f"{name}: {counted(len(one.logs), 'log')}"
-        if one.left_out:
-            head += f", {len(one.left_out)} not used"
-        if one.reason:
-            head += f": no calibration: {escaped(one.reason)}"
+    for calibration in calibrations:
+        name = ", ".join(str(LogText(part)) for part in (calibration.robot, calibration.group) if part) or "all logs"
+        head = f"{name}: {counted(len(calibration.logs), 'log')}"
+        if calibration.left_out:
+            head += f", {len(calibration.left_out)} not used"
+        if calibration.reason:
+            head += f": no calibration: {escaped(calibration.reason)}"
         else:
-            head += f": multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}{one.within_text}, in {one.file}"
+            head += f": multiplier {calibration.multiplier:.4f} ± {calibration.multiplier_std:.4f}"
+            head += f"{calibration.within_text}, in {calibration.file}"
         lines = textwrap.wrap(head, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
         parts.append("\n".join(lines))
     return "\n".join(parts) + "\n"
 
 
 def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Sequence[str]) -> None:
-    """Draw the ICRs by robot and date, and the error of each log; older pictures are removed.
+    """Draw the ICRs by robot and date, and the error of each log; older figures are removed.
 
     Parameters
     ----------
     folder : folder of the batch
+    picture_formats : formats of the files
     """
     from icrtool.output.figures.calibrations import FleetNumbers
 
     points: list[FleetLog] = []
     errors: dict[str, dict[str, float]] = {}
     names = {name for row in rows for name in row.errors}
-    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in names), ("", documents.SHOWN_FALLBACK))
+    model, error_name = next(
+        ((model, column) for model, column in SHOWN_ERRORS.items() if column in names), ("", documents.SHOWN_FALLBACK)
+    )
     for row in sorted(rows, key=lambda row: row.start_utc):
         shown = all(row.icr.get(name) is not None for name in ("y_icr_right_m", "y_icr_left_m"))
         if shown and row.start_utc:
@@ -213,6 +222,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
 
 
 def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
+    """Write the rows of fleet.csv as a Parquet file, with a type for each column."""
     import pyarrow as pa
     import pyarrow.json as pj
     import pyarrow.parquet as pq
@@ -222,7 +232,7 @@ def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
     counts = {"events", "outages", "warnings", "gates_failed", *(name for name in rows[0] if name.endswith(IS_BOUND))}
     kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in rows[0]}
     # Names of files need not be valid text. Lists are written as JSON, because pyarrow would load pandas for lists.
-    cells = ({name: as_text(one) if name in texts else one for name, one in row.items()} for row in rows)
+    cells = ({name: as_text(cell) if name in texts else cell for name, cell in row.items()} for row in rows)
     lines = b"\n".join(map(msgspec.json.encode, cells))
     table = pj.read_json(
         pa.BufferReader(lines), pj.ReadOptions(block_size=len(lines) + 1), pj.ParseOptions(pa.schema(kinds))
@@ -245,7 +255,7 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
     ----------
     missing : logs of the baseline that the batch does not have
     """
-    # Imported here, because a process that fits logs does not need these modules.
+    # The import is inside the function, because a process that fits logs does not need these modules.
     from icrtool.output.exports.acceptance import limit_section
 
     errors, changes = [], changes_of(rows, missing)
@@ -254,19 +264,24 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
             errors.append([row.log, f"could not be used: {row.reason}", "", ""])
             continue
         now, before = row.shown_error(), row.shown_error(baseline=True)
-        both = ["-" if one is None else f"{one:.3f} m" for one in (now, before)]
+        both = ["-" if error_m is None else f"{error_m:.3f} m" for error_m in (now, before)]
         difference = f"{now - before:+z.3f} m" if now is not None and before is not None else "-"
         errors.append([row.log, *both, difference])
     return [
         Title(counted(len(rows), "log"), counts_text(rows)),
-        limit_section([one for row in rows for one in row.verdicts]),
+        limit_section([verdict for row in rows for verdict in row.verdicts]),
         Table("lr", errors, ("log", "95 % after 10 m", "baseline", "difference")),
         Section("Since the baseline", [Items(changes)]),
     ]
 
 
 def changes_of(rows: Sequence[FleetLog], missing: Sequence[str]) -> list[str]:
-    """Return one sentence for each difference of logs, configuration and version from the baseline."""
+    """Return a sentence for each difference of logs, configuration and version from the baseline.
+
+    Parameters
+    ----------
+    missing : logs of the baseline that the batch does not have
+    """
     lines = [f"not in this batch, but in the baseline: {', '.join(missing)}"] if missing else []
     new = [row.log for row in rows if row.status != "failed" and not row.baseline]
     if new and len(new) < len(rows):
@@ -289,12 +304,12 @@ def pooled_calibrations(
 
     Parameters
     ----------
-    directory : folder of the batch on disk; calibration files are written below it
-    place : address of a batch that is not on disk; the runs are at this address
-    allow_unusable : runs that are not usable are calibrated too
+    directory : folder of the batch on disk, to which the calibration files are written
+    place : folder or address of the runs; None: `directory`
+    allow_unusable : whether unusable runs are calibrated too
     """
     try:
-        stored = {one.key: one for one in formats.read_fleet(directory).calibrations}
+        stored = {calibration.key: calibration for calibration in formats.read_fleet(directory).calibrations}
     except (OSError, ValueError, RecursionError):
         stored = {}
     groups: dict[tuple[str, str], list[FleetLog]] = {}
@@ -314,26 +329,26 @@ def pooled_calibrations(
             yield unchanged
         else:
             empty = FleetCalibration(robot, group, tuple(row.log for row in members), key=key)
-            yield _pooled(empty, members, directory, place or directory, name, allow_unusable=allow_unusable)
+            yield _pool_calibration(empty, members, directory, place or directory, name, allow_unusable=allow_unusable)
 
 
 def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
-    """Return the usable runs of a batch by group: the group of the manifest, else the name of the robot.
+    """Return the directories of the usable runs of a batch by group: the group of the manifest, else the robot.
 
-    Different robots in one group of the manifest form different groups. Of copies of a log in a group, the first copy
-    counts.
+    Different robots in one group of the manifest form different groups. Of copies of a log in a group, only the first
+    is returned.
 
     Raises
     ------
     RunError
         The folder does not hold the result of a batch.
     """
-    logs = [one for one in formats.logs_of_fleet(directory) if one.usable]
-    robots = {one.robot for one in logs}
+    logs = [row for row in formats.logs_of_fleet(directory) if row.usable]
+    robots = {row.robot for row in logs}
     by_group: dict[str, dict[tuple[str, ...], Path]] = {}
-    for one in logs:
-        name = one.group if one.group and len(robots) == 1 else f"{one.robot} {one.group}".strip() or directory.name
-        by_group.setdefault(name, {}).setdefault(_content(one.inputs), directory / one.run)
+    for row in logs:
+        name = row.group if row.group and len(robots) == 1 else f"{row.robot} {row.group}".strip() or directory.name
+        by_group.setdefault(name, {}).setdefault(_content(row.inputs), directory / row.run)
     return {name: list(runs.values()) for name, runs in by_group.items()}
 
 
@@ -342,14 +357,29 @@ def is_fleet(directory: Path) -> bool:
     return is_regular(Below(directory, FLEET_FILE))
 
 
-def _pooled(
-    one: FleetCalibration, members: Sequence[FleetLog], directory: Path, place: Path, name: str, *, allow_unusable: bool
+def _pool_calibration(
+    empty: FleetCalibration,
+    members: Sequence[FleetLog],
+    directory: Path,
+    place: Path,
+    name: str,
+    *,
+    allow_unusable: bool,
 ) -> FleetCalibration:
+    """Return the calibration of the logs of one robot and group, and write its file.
+
+    Parameters
+    ----------
+    empty : calibration without numbers, with robot, group and logs
+    members : rows of the logs
+    directory, place : as for `pooled_calibrations`
+    name : name of the file without suffix
+    """
     from icrtool.calibration.pooled import calibrate_runs
     from icrtool.output.tables.calibration import held_out_blocks
     from icrtool.output.text_blocks import format_blocks
 
-    # A copy of a log would be tested with parameters that were fitted to the same log.
+    # Copies are left out, because a copy would be tested with parameters that were fitted to the same log.
     distinct = {_content(row.inputs): row for row in reversed(members)}
     ordered = sorted(distinct.values(), key=lambda row: (row.start_utc, row.log))
     total_s = sum(row.duration_s or 0.0 for row in ordered)
@@ -370,15 +400,15 @@ def _pooled(
         make_folders(Below(directory, CALIBRATIONS))
         formats.write_calibration(result.calibration, Below(directory, file))
     except IcrToolError as err:
-        left_out = tuple(log for log in one.logs if log not in opened)
-        return replace(one, left_out=left_out, reason=str(err))
+        left_out = tuple(log for log in empty.logs if log not in opened)
+        return replace(empty, left_out=left_out, reason=str(err))
     numbers = result.calibration.controller
     table = format_blocks(held_out_blocks(result.table))
     reached = result.table.score("recommended").within(result.table.horizons_m, documents.BUDGET_M)
     short = {name for name, _ in result.left_out}
     used = tuple(log for log, run_name in opened.items() if run_name not in short)
     return replace(
-        one, logs=used, left_out=tuple(log for log in one.logs if log not in used), file=file,
+        empty, logs=used, left_out=tuple(log for log in empty.logs if log not in used), file=file,
         recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),
         multiplier_std=float(numbers.multiplier_std), table=table,
         icrs_m=tuple(result.calibration.geometry[name] for name in ICR_COLUMNS),
@@ -389,5 +419,5 @@ def _pooled(
 
 
 def _content(inputs: Sequence[FleetFile]) -> tuple[str, ...]:
-    """Return the SHA-256 of each file of a log, equal for copies; place and version of a file without SHA-256."""
+    """Return a key for the content of a log: the SHA-256 of each file, else its path, size and version."""
     return tuple(sorted(file.sha256 or f"at {file.path} {file.bytes} {file.version} {file.address}" for file in inputs))

@@ -1,4 +1,4 @@
-"""One log of a batch: its run and its report, and its row in the tables."""
+"""Processing of one log of a batch: its run, its report, and its row in the tables."""
 
 from __future__ import annotations
 
@@ -43,18 +43,20 @@ def path_from_bytes(name: bytes) -> Path:
 
 
 def process_log(request: LogRequest, watch: Watch) -> FleetLog:
-    """Fit a log, analyse the run, write both, and return its row; the row of an unusable log states the reason.
+    """Fit a log, analyse the run, write both, and return the row of the log.
+
+    No error about the log is raised: the row of a failed log states the reason.
 
     Parameters
     ----------
-    watch : called with the name of each stage
+    watch : called with the name of each stage when it begins
     """
     begun = time.monotonic()
     path, folder = path_from_bytes(request.path), path_from_bytes(request.folder)
     try:
-        row = _results(request, watch)
+        row = _fit_and_report(request, watch)
     except IcrToolError as err:
-        # A second attempt may find space on the disk, or a complete log. An error in the content would come again.
+        # A second attempt may find free space or a complete log. An error in the content would occur again.
         reason = err.text_without(str(path), str(folder / request.known.run), log_name(path))
         row = row_of_failure(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
     except OSError as err:
@@ -70,25 +72,32 @@ def process_log(request: LogRequest, watch: Watch) -> FleetLog:
 
 
 def row_of_failure(request: LogRequest, reason: str, *, details: str = "", repeatable: bool) -> FleetLog:
-    """Return the row of a log that could not be processed."""
+    """Return the row of a log that could not be processed.
+
+    Parameters
+    ----------
+    details : last lines of the output of its process
+    repeatable : whether the same input would fail again
+    """
     inputs: tuple[FleetFile, ...] = ()
-    with suppress(OSError):  # the log was removed, or is a device
-        inputs = files_of(path_from_bytes(request.path)) if repeatable else ()
+    # The log may have been removed, or be a device.
+    with suppress(OSError):
+        inputs = hashed_files(path_from_bytes(request.path)) if repeatable else ()
     return replace(
         request.known, reason=reason, usable=False, details=details, repeatable=repeatable, inputs=inputs,
         tool_version=__version__,
     )  # fmt: skip
 
 
-def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, ...]:
-    """Return the files of a log with their sha256; files in `inputs` are not read again.
+def hashed_files(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, ...]:
+    """Return the files of a log with their SHA-256; files in `inputs` are not hashed again.
 
-    For a log at an address only the files in `inputs` are known.
+    For a log at an address, the files in `inputs` are returned.
     """
     if isinstance(path, UrlPath):
         return tuple(
-            FleetFile(one.path, one.bytes, 0, one.sha256, one.version or one.etag or "", one.address or "")
-            for one in inputs
+            FleetFile(file.path, file.bytes, 0, file.sha256, file.version or file.etag or "", file.address or "")
+            for file in inputs
         )
     hashes = {file.path: file.sha256 for file in inputs}
     files = []
@@ -101,14 +110,16 @@ def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, .
     return tuple(files)
 
 
-def _results(request: LogRequest, watch: Watch) -> FleetLog:
-    """Fit and analyse a log, write run and report, and return the row of the log."""
+def _fit_and_report(request: LogRequest, watch: Watch) -> FleetLog:
+    """Fit and analyse a log, write run and report, and return the row of the log; raise errors about the log."""
     from icrtool.output.dropout_directory import open_baseline
 
     path, folder = path_from_bytes(request.path), path_from_bytes(request.folder)
-    asked, files = request.report, request.files
-    calibrations = [_calibration_of(one) for one in request.calibrations]
-    with fit_into(Below(folder, request.known.run), path, request.config, asked.fit, files, watch) as run_and_directory:
+    options, files = request.report, request.files
+    calibrations = [_calibration_of(file) for file in request.calibrations]
+    with fit_into(
+        Below(folder, request.known.run), path, request.config, options.fit, files, watch
+    ) as run_and_directory:
         run, partial = run_and_directory
         baseline = None
         if request.baseline:
@@ -116,7 +127,7 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
             baseline = open_baseline(path_from_bytes(request.baseline)).find(
                 row.log, run.document.content, row.robot, row.group
             )
-        report = report_into(partial, run, asked, files, watch, calibrations=calibrations, baseline=baseline)
+        report = report_into(partial, run, options, files, watch, calibrations=calibrations, baseline=baseline)
     summary = run.document
     icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}
     controller = summary.controller
@@ -124,8 +135,8 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
         controller = report.calibration.controller
     document = report.document
     unusable = f"not usable: {document.unusable_because}" if not document.usable else ""
-    cut = next((one.sentence for one in summary.notes if one.code == "log_cut_off"), "")
-    within = [(f"{one.model}_within_{one.budget_m:g}m_m", one) for one in report.document.budgets]
+    cut = next((finding.sentence for finding in summary.notes if finding.code == "log_cut_off"), "")
+    within = [(f"{budget.model}_within_{budget.budget_m:g}m_m", budget) for budget in report.document.budgets]
     earlier = report.baseline.document.models if report.baseline is not None else ()
     return replace(
         request.known,
@@ -139,33 +150,34 @@ def _results(request: LogRequest, watch: Watch) -> FleetLog:
         | {f"std_{name}": std for name, (_, std) in icrs.items()},
         multiplier=None if controller is None else controller.multiplier,
         multiplier_std=None if controller is None else controller.multiplier_std,
-        errors=_errors(report.document.models)
-        | {name: plain_value(one.distance_m) for name, one in within}
-        | {next_low_name(one.model, one.budget_m): one.to_plan_with_m for _, one in within},
-        bounds=tuple(name for name, one in within if one.beyond),
+        errors=_error_columns(report.document.models)
+        | {name: plain_value(budget.distance_m) for name, budget in within}
+        | {next_low_name(budget.model, budget.budget_m): budget.to_plan_with_m for _, budget in within},
+        bounds=tuple(name for name, budget in within if budget.beyond),
         events=len(summary.events),
         outages=len(report.outages),
         warnings=len(summary.warnings),
         # The row is sent to another process as JSON, and msgspec does not encode a `LogText`.
         notes=tuple(
-            replace(one, subject=str.__str__(one.subject), text=str.__str__(one.text)) for one in summary.notes
+            replace(finding, subject=str.__str__(finding.subject), text=str.__str__(finding.text))
+            for finding in summary.notes
         ),
-        verdicts=tuple(fleet_verdict(one, request.known.log) for one in report.document.gates),
-        baseline=_errors(one for one in earlier if report.result(one.name) is not None),
+        verdicts=tuple(fleet_verdict(verdict, request.known.log) for verdict in report.document.gates),
+        baseline=_error_columns(model for model in earlier if report.result(model.name) is not None),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
-        inputs=files_of(path, summary.inputs),
+        inputs=hashed_files(path, summary.inputs),
     )
 
 
 def _calibration_of(input_file: CalibrationInput) -> Calibration:
-    """Return the calibration in a file of a batch.
+    """Return the calibration in a file that the batch was started with.
 
     Raises
     ------
     OSError
         The file was removed.
     LogChangedError
-        The file changed since the batch began; the key of the row holds the SHA-256 of the former content.
+        The file changed after the batch began; the key of the row holds the SHA-256 of the former content.
     """
     from icrtool.output.files.formats import open_calibration
 
@@ -175,12 +187,12 @@ def _calibration_of(input_file: CalibrationInput) -> Calibration:
     return open_calibration(file)
 
 
-def _errors(models: Iterable[ModelDocument]) -> dict[str, float | None]:
-    """Return p95, its interval, and the expected error of each model of a report [m], by names of columns."""
+def _error_columns(models: Iterable[ModelDocument]) -> dict[str, float | None]:
+    """Return p95, its interval and the expected error of each model of a report [m], by the names of columns."""
     return {
-        f"{one.name}_{metric}_{row.horizon_m:g}m_m": number
-        for one in models
-        for row in one.by_horizon
+        f"{model.name}_{metric}_{row.horizon_m:g}m_m": number
+        for model in models
+        for row in model.by_horizon
         if row.horizon_m in FLEET_HORIZONS_M
         for metric, number in (
             ("p95", row.p95_m), ("expected", row.expected_error_m),

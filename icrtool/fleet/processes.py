@@ -1,8 +1,8 @@
-"""Processes that work on logs. A process that hangs is killed; a process that dies affects one log only.
+"""Worker processes of a batch. A process that hangs is killed; a process that dies affects one log only.
 
 A process works on one log after the other, so that it loads libraries and compiled code once. It reads requests from
-its standard input as lines of JSON, and writes stages (texts) and rows (objects) to its standard output. The threads of
-a batch on this machine and the threads of the workers of a cluster call the same function for each log.
+its standard input as lines of JSON, and writes stages (texts) and rows (objects) to its standard output. Threads on
+this machine, or threads of the workers of a cluster, call `process_apart` for each log.
 
 `pebble.ProcessPool` and `concurrent.futures` are not used: an exception that cannot be unpickled, or a process killed
 while it starts, ends all logs of their pools (pebble 5.2.3), and `concurrent.futures` has no time limit for a log.
@@ -44,43 +44,50 @@ KILL_GRACE_S = 0.3
 """Time in which a process may remove its unfinished files before it is killed [s]."""
 
 LONGEST_DETAILS = 4000
-"""Largest length of the kept output of a process that died [characters]."""
+"""Largest length of the output that is kept of a process that died [characters]."""
 
 ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg",
     "MALLOC_ARENA_MAX": "1", "ARROW_DEFAULT_MEMORY_POOL": "system",
 }  # fmt: skip
-"""Environment variables of a process. Libraries use one thread, because several logs are processed at the same time;
-the settings of memory are the settings in `icrtool.cli.main`."""
+"""Environment variables of a process. Libraries use one thread, because several logs are processed at the same time.
+The settings of the memory are the same as in `icrtool.cli.main`."""
 
 NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
-"""Environment variable that Dask sets for its workers. Processes of a batch do not get it: it makes glibc give memory
-back to the system again and again, which doubles the system time."""
+"""Environment variable that Dask sets for its workers, and that processes of a batch do not get. With it, glibc returns
+memory to the system so often that the system time doubles."""
 
 PROCESS_COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.processes")
+"""Command of a worker process."""
 
 Lines = queue.SimpleQueue[bytes]
+"""Queue of lines of text."""
 
-Lost = Callable[[], str]
-"""Function that returns why no log can be processed any more, for example a lost scheduler; else an empty text."""
+LossReason = Callable[[], str]
+"""Function that returns why no more logs can be processed, such as a lost scheduler; empty while they can."""
 
 PROCESS_BYTES = 400 << 20
 """Memory that a process needs for a small log [bytes]."""
 
 LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
-"""Memory that a log needs: `LOG_FACTOR` times its size, at most `LOG_BYTES` [bytes], the memory of 10 h at 100 Hz."""
+"""Memory that a log needs: `LOG_FACTOR` times its size, at most `LOG_BYTES` [bytes], which 10 h at 100 Hz need."""
 
 _ANSWER: msgspec.json.Decoder[str | FleetLog] = msgspec.json.Decoder(str | FleetLog)
-"""Decoder of answers, made at import, because msgspec crashes if several threads use a type for the first time."""
+"""Decoder of the answers of a process. It is made at import, because msgspec crashes if several threads use a type for
+the first time."""
 
 _over = threading.Event()
+"""Set when this process is about to end."""
+
 _all: set[Worker] = set()
+"""All worker processes."""
+
 _idle: list[Worker] = []
-"""Processes that wait for a log. A thread with a log takes one of these processes, or starts a new process."""
+"""Worker processes that wait for a log. A thread with a log takes one of them, or starts a new process."""
 
 
 def process_apart(request: bytes, timeout_s: float, watch: Watch = unwatched) -> FleetLog:
-    """Return the row of a log, made by a separate process; the row states the reason if that process hangs or dies.
+    """Return the row of a log, made by a separate process; if this process hangs or dies, the row states the reason.
 
     Parameters
     ----------
@@ -101,7 +108,7 @@ def process_apart(request: bytes, timeout_s: float, watch: Watch = unwatched) ->
 
 
 def end_for_good() -> None:
-    """End all worker processes, and prevent that new ones are started, because this process is about to end."""
+    """End all worker processes, and start no new ones, because this process is about to end."""
     _over.set()
     close_all()
 
@@ -119,14 +126,15 @@ def close_all() -> None:
 @contextmanager
 def executor_of(
     logs: Sequence[Path], jobs: int | None, scheduler: str | None, worker_timeout_s: float
-) -> Iterator[tuple[Executor, Lost]]:
-    """Yield an executor of `process_apart`, threads or a Dask cluster, and a function that reports whether it is lost.
+) -> Iterator[tuple[Executor, LossReason]]:
+    """Yield an executor for `process_apart` (threads or a Dask cluster), and a function that returns why it is lost.
 
     Parameters
     ----------
-    jobs : number of logs that are processed at the same time on this machine; default: `default_jobs`
-    scheduler : address of the cluster; None: this machine
-    worker_timeout_s : a cluster without scheduler or worker for this time [s] is lost
+    logs : paths of all logs of the batch
+    jobs : number of logs that are processed at the same time on this machine; None: `default_jobs`
+    scheduler : address of the scheduler of a cluster; None: this machine
+    worker_timeout_s : time without scheduler or worker after which a cluster is lost [s]
 
     Raises
     ------
@@ -152,16 +160,16 @@ def executor_of(
     except (OSError, ValueError) as err:
         raise ConfigError(f"--scheduler {scheduler}", "no Dask scheduler answers there", str(err)) from err
     with client:
-        # All other logs are done at this point. A shutdown that waits would never end if the cluster is lost.
-        yield client.get_executor(), _loss_of(client, worker_timeout_s)
+        # Dask's client is closed without waiting for the cluster, because a lost cluster never answers.
+        yield client.get_executor(), _loss_reason(client, worker_timeout_s)
 
 
-def _loss_of(client: Client, worker_timeout_s: float) -> Lost:
-    """Return a function that reports that a cluster had no scheduler or no worker for `worker_timeout_s`."""
-    fine_s, given_up = time.monotonic(), ""
+def _loss_reason(client: Client, worker_timeout_s: float) -> LossReason:
+    """Return a function that returns a reason if a cluster had no scheduler or no worker for `worker_timeout_s`."""
+    alive_s, given_up = time.monotonic(), ""
 
     def lost() -> str:
-        nonlocal fine_s, given_up
+        nonlocal alive_s, given_up
         if given_up:
             return given_up
         why = "the scheduler of the cluster is gone"
@@ -170,8 +178,8 @@ def _loss_of(client: Client, worker_timeout_s: float) -> Lost:
                 workers = client.scheduler_info(n_workers=-1)["workers"]
                 why = "" if workers else f"the cluster had no worker for {worker_timeout_s:g} s"
         if not why:
-            fine_s = time.monotonic()
-        elif client.status == "closed" or time.monotonic() - fine_s > worker_timeout_s:
+            alive_s = time.monotonic()
+        elif client.status == "closed" or time.monotonic() - alive_s > worker_timeout_s:
             given_up = why
         return given_up
 
@@ -179,7 +187,10 @@ def _loss_of(client: Client, worker_timeout_s: float) -> Lost:
 
 
 def default_jobs(logs: Sequence[Path]) -> int:
-    """Return the smallest of the numbers of cores, of logs, and of largest logs that fit into the free memory."""
+    """Return the number of logs to process at the same time: at most the cores, the logs, and what the memory holds.
+
+    The memory is divided by the need of the largest log.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     sizes = [sum(file.stat().st_size for file in files_of_log(log) if file.is_file()) for log in logs]
     largest = max(sizes, default=0)
@@ -189,7 +200,7 @@ def default_jobs(logs: Sequence[Path]) -> int:
 
 
 def _free_bytes() -> int | None:
-    """Return the memory that is free for processes; None where the system does not state it."""
+    """Return the memory that is free for processes [bytes]; None where the system does not state it."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
@@ -198,14 +209,14 @@ def _free_bytes() -> int | None:
 
 
 class Worker:
-    """A process that processes one log at a time."""
+    """A worker process, which processes one log at a time."""
 
     def __init__(self) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
         home = str(Path(__file__).resolve().parents[2])
         paths = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH")]))
         inherited = {name: value for name, value in os.environ.items() if name != NOT_INHERITED}
-        # In a new session, so that Ctrl-C reaches only the command, which then ends its workers.
+        # The process has its own session, so that Ctrl-C reaches only the command, which then ends its workers.
         self._process = subprocess.Popen(  # noqa: S603 - our own command
             PROCESS_COMMAND,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
@@ -214,12 +225,12 @@ class Worker:
         assert self._process.stdin is not None  # noqa: S101 - for the type checker
         assert self._process.stdout is not None  # noqa: S101 - as above
         self._requests = self._process.stdin
-        # This line, which is no answer, marks the end of the output.
-        self._answers = _lines_of(self._process.stdout, lambda lines: lines.put(b""))
+        # An empty line, which is no answer, marks the end of the output.
+        self._answers = _queue_lines(self._process.stdout, lambda lines: lines.put(b""))
         _all.add(self)
 
     def run(self, request: LogRequest, timeout_s: float, watch: Watch) -> FleetLog:
-        """Return the row of a log; arguments as in `process_apart`."""
+        """Return the row of a log that this process makes; arguments as in `process_apart`."""
         begun, begin_of_errors = time.monotonic(), self._errors.seek(0, os.SEEK_END)
         why = details = ""
         try:
@@ -233,9 +244,11 @@ class Worker:
                 watch(answer)
         except queue.Empty:
             why = f"took longer than {timeout_s:g} s and was ended"
-        except (OSError, ValueError):  # the process died, perhaps in the middle of a line
-            why = self._how_it_ended()
-            with suppress(ValueError):  # the pipe is closed after an interruption of the batch
+        except (OSError, ValueError):
+            # The process died, perhaps in the middle of a line.
+            why = self._end_reason()
+            # After an interruption of the batch, the file with the output is closed.
+            with suppress(ValueError):
                 self._errors.seek(begin_of_errors)
                 details = self._errors.read().decode(errors="replace").strip()[-LONGEST_DETAILS:]
             why += f": {details.splitlines()[-1]}" if details else ""
@@ -245,7 +258,8 @@ class Worker:
 
     def ask_to_end(self) -> None:
         """Close the input of the process, which then removes its unfinished files and ends."""
-        with suppress(OSError):  # the process has ended
+        # The process may have ended already.
+        with suppress(OSError):
             self._requests.close()
 
     def close(self, grace_s: float = KILL_GRACE_S) -> None:
@@ -258,7 +272,8 @@ class Worker:
         self._process.wait()
         self._errors.close()
 
-    def _how_it_ended(self) -> str:
+    def _end_reason(self) -> str:
+        """Return a text about how the process ended: by its exit status, or by a signal."""
         try:
             status = self._process.wait(10)
         except subprocess.TimeoutExpired:
@@ -269,8 +284,8 @@ class Worker:
         return f"its process was ended by {name}{', perhaps for lack of memory' if name == 'SIGKILL' else ''}"
 
 
-def _lines_of(stream: IO[bytes], at_end: Callable[[Lines], object]) -> Lines:
-    """Return a queue that a new thread fills with the lines of a stream."""
+def _queue_lines(stream: IO[bytes], at_end: Callable[[Lines], object]) -> Lines:
+    """Return a queue that a new thread fills with the lines of a stream; after the last one it calls `at_end`."""
     lines: Lines = queue.SimpleQueue()
 
     def read() -> None:
@@ -284,9 +299,9 @@ def _lines_of(stream: IO[bytes], at_end: Callable[[Lines], object]) -> Lines:
 
 
 def main() -> None:
-    """Process the logs that standard input asks for, until it ends."""
-    # Output of libraries goes to standard error. Both files are opened again, because a thread that waits for a line
-    # locks Python's standard input.
+    """Process the logs of the requests on standard input, until it ends."""
+    # Output of libraries goes to standard error. Standard input and output are opened again, because a thread that
+    # waits for a line locks Python's standard input.
     requests, output = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -301,7 +316,7 @@ def main() -> None:
         remove_unfinished()
         os._exit(1)
 
-    lines = _lines_of(requests, end)
+    lines = _queue_lines(requests, end)
     while True:
         send(process_log(decode_request(lines.get()), send))
 

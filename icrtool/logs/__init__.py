@@ -1,1 +1,1 @@
-"""Convert logs to tables and tables to logs. Only this package opens a log, and only this package converts ENU."""
+"""Conversion of logs to tables and of tables to logs. No other package opens a log or converts from ENU."""

@@ -1,4 +1,4 @@
-"""Read a CSV file into a data frame, in parts of bounded size; only the columns that a log can use are kept."""
+"""Reader of CSV files: a data frame with the columns that a log can use, read in parts of limited size."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ LONGEST_HEAD_BYTES, MOST_COLUMNS = 1 << 18, 4096
 million columns."""
 
 CELLS_AT_ONCE = 1 << 20
-"""Number of cells that are read at a time. A cell takes up to 100 bytes."""
+"""Number of cells that are read at a time. A cell takes up to 100 bytes of memory."""
 
 MOST_EMPTY, LEAST_CELLS = 4, 1_000_000
 """Largest number of cells for each byte of a file, and number of cells that every file may have. pandas makes a cell
-for each column of each row, so rows of two bytes under thousands of names would fill the memory."""
+for each column of each row, so that rows of two bytes under thousands of names would fill the memory."""
 
 _COUNTED_BYTES = 1 << 20
+"""Number of bytes whose line ends are counted at a time."""
 
 MORE_VALUES = "its rows have more values than its first line has names"
-"""Reason for refusing a table with values that belong to no column."""
+"""Reason why a table with values that belong to no column is refused."""
 
 
 class TableForm(NamedTuple):
-    """The character between the columns of a table, its decimal sign, and the number of its columns."""
+    """Separator of the columns of a table, its decimal sign, and the number of its columns."""
 
     separator: str
     decimal: str
@@ -38,14 +39,14 @@ class TableForm(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Description of the form for messages; empty for columns separated by commas."""
+        """Text about the form for messages; empty for columns that are separated by commas."""
         signs = {";": "semicolons", "\t": "tabs"}
         comma = ", decimal comma" if self.decimal == "," else ""
         return f"{signs[self.separator]} between columns{comma}" if self.separator in signs else ""
 
 
 def table_form(head: bytes, row: bytes) -> TableForm:
-    """Return the form of a table, by its first line and first row.
+    """Return the form of a table, given its first line (names) and its first row of values.
 
     If semicolons or tabs separate the columns, as in countries with a decimal comma, a comma in the row is the decimal
     sign.
@@ -56,16 +57,16 @@ def table_form(head: bytes, row: bytes) -> TableForm:
 
 
 def csv_frame(path: Path) -> pd.DataFrame:
-    """Return the columns of a CSV file that a log can use; the first line names them.
+    """Return the columns of a CSV file that a log can use, by the names in its first line.
 
-    `attrs` of the data frame hold the form of the table, and its first names.
+    The `attrs` of the data frame hold the form of the table (``form``) and the names of all columns (``names``).
 
     Raises
     ------
     OSError
         The file cannot be read.
     ValueError
-        The file is not a table: it is not UTF-8, names too many columns, or has rows with more values than columns or
+        The file is no table: it is not UTF-8, names too many columns, or has rows with more values than columns or with
         far fewer.
     """
     import pandas as pd
@@ -84,7 +85,7 @@ def csv_frame(path: Path) -> pd.DataFrame:
         _check_cells(stream, form)
     parts, names = [], list[object]()
     with warnings.catch_warnings():
-        # pandas warns of rows with more values than names, and drops the further values.
+        # In rows with more values than names, pandas drops the further values and only warns.
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             with pd.read_csv(
@@ -102,7 +103,7 @@ def csv_frame(path: Path) -> pd.DataFrame:
 
 
 def _next_line(stream: BinaryIO) -> bytes:
-    """Return the next line that is not blank, at most `LONGEST_HEAD_BYTES` of it; blank at the end."""
+    """Return the next line that is not blank, at most `LONGEST_HEAD_BYTES` of it; empty at the end of the stream."""
     while (line := stream.readline(LONGEST_HEAD_BYTES)) and not line.strip():
         pass
     return line
@@ -123,7 +124,7 @@ def _check_cells(stream: BinaryIO, form: TableForm) -> None:
     Raises
     ------
     ValueError
-        Its lines have few values, and its first line has many names.
+        The first line has many names, and the rows have values in few of these columns.
     """
     stream.seek(0)
     size = rows = 0

@@ -1,7 +1,7 @@
-"""Read a log: open it, read the columns of all candidates in one pass, choose, convert to the frames of `icrtool`.
+"""Reader of logs: all candidates are read in one pass, the topics are chosen, and their samples converted.
 
-A log may also be one CSV file (columns: `icrtool.RobotLog.from_frames`). `survey_document` returns the content of a log
-before topics are chosen; `icrtool info` prints it.
+A log may also be a CSV file (columns: `icrtool.RobotLog.from_frames`). `survey_document` returns the content of a log
+before topics are chosen, which `icrtool info` prints.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def survey_log(
 
     Parameters
     ----------
-    path : a log, as for `open_log`
+    path : path or address of a log, as for `read_log`, but no table
     progress : called with the share of the log that has been read, 0 to 1
     start, end : as for `read_log`
 
@@ -67,6 +67,8 @@ def survey_log(
     ------
     LogError
         The log cannot be opened, or was written to while it was read.
+    DataError
+        The end is not after the start, or no message lies between them.
     """
     config = config if config is not None else Config()
     path = place_of(path)
@@ -82,7 +84,7 @@ def survey_log(
             candidates = find_candidates(tables, config, unread)
             inputs.result()
         except BaseException:
-            # The pool waits for its threads before Ctrl-C or an error reaches the caller.
+            # The pool waits for its threads before Ctrl-C or an error reaches the caller, so that they must end soon.
             ended.set()
             raise
         channels, transfer = tuple(container.channels), container.transfer()
@@ -108,8 +110,9 @@ def read_log(
         recording; or a ``.csv`` with the columns of `icrtool.RobotLog.from_frames`, also compressed
     config : topics, robot and frames; default: all found by type and content
     progress : called with the share of the bytes that are read, 0 to 1
-    start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
-        a `datetime` or ISO 8601 text, in UTC where it has no zone. Static transforms are read from all of the log.
+    start, end : only messages with log times in [start, end) are read. A moment is a number of seconds since the first
+        message of the log, or date and time as `datetime` or ISO 8601 text, in UTC if it has no zone. Static transforms
+        are read from the whole log
 
     Raises
     ------
@@ -132,7 +135,7 @@ def read_log(
 def _collect(
     container: Container, config: Config, progress: Progress | None, cut: Cut
 ) -> tuple[list[TopicTable], dict[str, str]]:
-    """Return the columns of all channels that may have a role, read in one pass over the log."""
+    """Return the tables of all channels that may have a role, read in one pass, and the reasons for unread topics."""
     wanted = wanted_fields(container.channels, config)
     static = frozenset(channel.id for channel in container.channels if is_static(channel))
     cut = cut._replace(whole=static) if cut != WHOLE else cut
@@ -143,10 +146,10 @@ def _collect(
     by_id = {channel.id: channel for channel in container.channels}
     moving = {number for number in wanted if by_id[number].message_type in TRANSFORM_TYPES} - static
     poses = {by_id[number].topic for number in moving}
-    for place, table in enumerate(tables):
+    for index, table in enumerate(tables):
         if table.topic in poses and len(table):
             try:
-                tables[place] = transform_pose(table)
+                tables[index] = transform_pose(table)
             except DefinitionError as err:
                 unread[table.topic] = err.why
     return tables, unread
@@ -155,12 +158,13 @@ def _collect(
 def collect_tables(
     container: Container, wanted: Mapping[int, tuple[str, ...]], cut: Cut = WHOLE, progress: Progress | None = None
 ) -> tuple[list[TopicTable], dict[str, str]]:
-    """Return the columns of some channels, read in one pass, and by topic why other channels could not be read.
+    """Return the tables of some channels, read in one pass, and for each unreadable topic the reason.
 
     Parameters
     ----------
-    wanted : fields by channel id
-    progress : called with the share of the log that has been read
+    wanted : paths of the fields to read, by channel id
+    cut : part of the log that is read
+    progress : called with the share of the log that has been read, 0 to 1
     """
     unread: dict[str, str] = {}
     collectors: dict[int, TopicCollector | None] = {}
@@ -169,9 +173,10 @@ def collect_tables(
     by_id = {channel.id: channel for channel in container.channels}
     topics = {channel.id: (channel.topic, channel.message_type) for channel in container.channels}
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
-        for whole in blocks:
-            block = cut.apply(whole)
-            numbers = np.sort(block.channel)  # np.unique takes four times as long as sorting
+        for uncut_block in blocks:
+            block = cut.apply(uncut_block)
+            # np.unique takes four times as long as sorting.
+            numbers = np.sort(block.channel)
             for number in numbers[np.diff(numbers, prepend=-1) > 0].tolist():
                 if number not in wanted:
                     continue
@@ -197,14 +202,18 @@ def collect_tables(
 
 
 def _report_definitions(container: Container, channels: Sequence[Channel]) -> None:
-    """Report the channels that are read with a bundled definition, because the log's definition is damaged."""
+    """Report each channel that is read with a bundled definition because the definition in the log is damaged."""
     for channel in channels:
         if note := definition_note(channel):
             container.report("definition_bundled", f"{channel.topic}: {note}; the bundled definition is used")
 
 
 def read_moment(moment: Moment | None, key: str) -> float | datetime | None:
-    """Return a moment as seconds since the log's first message, or as a time with a zone.
+    """Return a moment as seconds since the first message of the log, or as a `datetime` with a zone.
+
+    Parameters
+    ----------
+    key : name of the moment in errors: ``start`` or ``end``
 
     Raises
     ------
@@ -228,22 +237,29 @@ def read_moment(moment: Moment | None, key: str) -> float | datetime | None:
 
 
 def cut_of(container: Container, start: float | datetime | None, end: float | datetime | None, log: Path) -> Cut:
-    """Return the part of a log between two times, as log times.
+    """Return the part of a log between two moments.
+
+    Parameters
+    ----------
+    start, end : results of `read_moment`; None: begin or end of the log
+    log : path of the log in errors
 
     Raises
     ------
     DataError
-        The end is not after the start, or the log has no message between them.
+        The end is not after the start, or no message lies between them.
     """
     if start is None and end is None:
         return WHOLE
     first, span = 0, container.span_ns()
-    if span is not None and span[0] >= LATEST_NS:  # the container converts such times in the same manner
+    # The container converts log times beyond LATEST_NS in the same manner.
+    if span is not None and span[0] >= LATEST_NS:
         span = folded_ns(span[0]), folded_ns(span[1])
     if isinstance(start, float) or isinstance(end, float):
         if span is not None:
             first = span[0]
-        else:  # without an index, only reading all messages gives the first and the last time
+        else:
+            # Without an index, all messages are read to find the first time.
             blocks = container.blocks(frozenset(channel.id for channel in container.channels))
             first = min((int(block.log_time_ns.min()) for block in blocks if len(block.log_time_ns)), default=0)
     begin_ns = max(log_time_of(start, first), 0) if start is not None else 0
@@ -258,28 +274,32 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
     return Cut(begin_ns, min(end_ns, LATEST_NS))
 
 
-def log_time_of(given: float | datetime, first_ns: int) -> int:
-    """Return a moment as log time [ns]."""
-    if isinstance(given, datetime):
-        passed = given - datetime(1970, 1, 1, tzinfo=UTC)
+def log_time_of(moment: float | datetime, first_ns: int) -> int:
+    """Return a moment as log time [ns]; `first_ns` is the log time of the first message."""
+    if isinstance(moment, datetime):
+        passed = moment - datetime(1970, 1, 1, tzinfo=UTC)
         return (passed.days * 86_400 + passed.seconds) * 1_000_000_000 + passed.microseconds * 1000
-    return first_ns + round(max(min(given, 1e9), -1e9) * 1e9)
+    return first_ns + round(max(min(moment, 1e9), -1e9) * 1e9)
 
 
 def is_table(path: Path) -> bool:
-    """Return whether a path, or an address, names a table."""
+    """Return whether a path or an address names a CSV table, by its suffix."""
     return _CSV_NAME.search(path.name) is not None and (path.is_file() or isinstance(path, UrlPath))
 
 
 def read_table(path: Path, start: Moment | None = None, end: Moment | None = None) -> RobotLog:
-    """Return the log in a CSV file, also compressed, with a row for each stamp and the columns measured at this stamp.
+    """Return the log in a CSV file, also compressed, which has a row for each stamp.
+
+    Parameters
+    ----------
+    start, end : as for `read_log`
 
     Raises
     ------
     LogError
-        The file is not a CSV table.
+        The file is no CSV table.
     DataError
-        A column is missing or holds a value that is not a number.
+        A column is missing, or holds a value that is not a number.
     """
     import pandas as pd
 
@@ -310,14 +330,14 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
 
 
 TOPIC_GAP_IN_INTERVALS = 5.0
-"""Shortest gap, in median intervals of the topic."""
+"""Shortest gap between messages of a topic, as a multiple of their median interval."""
 
 SHORTEST_GAP_S = 0.1
-"""Shortest gap [s]."""
+"""Shortest gap between messages of a topic [s]."""
 
 
 def long_intervals(interval_s: Floats) -> Bools:
-    """Return whether each interval (n,) [s] between messages is a gap; a single interval is no gap."""
+    """Return a mask of the intervals between messages (n,) [s] that are gaps; a single interval is no gap."""
     if len(interval_s) < 2:
         return np.zeros(len(interval_s), np.bool_)
     return np.asarray(interval_s > max(TOPIC_GAP_IN_INTERVALS * float(np.median(interval_s)), SHORTEST_GAP_S))
@@ -329,11 +349,12 @@ class SurveyedTopic(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     messages : number of messages; None where it is not known
-    read : whether its messages were read, because the topic may have a role
-    rate_hz : 1 / median interval; None for a topic that was not read
-    gaps : number of intervals far longer than the median; `longest_gap_s` is the longest of them [s]
+    read : whether the messages were read, because the topic may have a role
+    rate_hz : 1 / median interval between messages; None for a topic that was not read
+    gaps : number of gaps between messages
+    longest_gap_s : longest gap [s]; None without a gap
     unreadable : number of messages that do not fit their type
-    not_read_because : why a topic of a type with a role was not read
+    not_read_because : reason why a topic with a type for a role was not read; None for other topics
     """
 
     topic: str
@@ -348,7 +369,14 @@ class SurveyedTopic(Record, frozen=True, kw_only=True):
 
 
 class SurveyedSource(Record, frozen=True):
-    """A candidate for a role. `problem`: why it cannot be used; `stamps`: statement about its clock."""
+    """A candidate for a role.
+
+    Attributes
+    ----------
+    why : text about its data and score
+    problem : reason why it cannot be used; None for a usable candidate
+    stamps : text about the clock of its stamps
+    """
 
     topic: str
     message_type: str
@@ -358,7 +386,15 @@ class SurveyedSource(Record, frozen=True):
 
 
 class SurveyDocument(Record, frozen=True):
-    """Content of a log before topics are chosen, for `icrtool info`. `transfer`: amount of data over a connection."""
+    """Content of a log before topics are chosen, for `icrtool info`.
+
+    Attributes
+    ----------
+    inputs : files of the log
+    transfer : text about the data that was transferred over a connection; None for a file on disk
+    topics : all topics of the log
+    candidates : candidates for each role, the best one first
+    """
 
     inputs: tuple[InputFile, ...]
     transfer: str | None
@@ -374,13 +410,13 @@ def survey_document(survey: Survey) -> SurveyDocument:
         table = tables.get(channel.topic)
         stamps = np.empty(0, np.int64) if table is None else table.log_time_ns
         interval = np.diff(stamps) / 1e9
-        long = long_intervals(interval)
+        is_gap = long_intervals(interval)
         topics.append(
             SurveyedTopic(
                 topic=str(channel.topic), message_type=str(channel.message_type),
                 messages=channel.count if table is None else len(table), read=table is not None,
-                rate_hz=rate_and_jitter(stamps)[0], gaps=int(np.count_nonzero(long)),
-                longest_gap_s=float(interval.max()) if long.any() else None,
+                rate_hz=rate_and_jitter(stamps)[0], gaps=int(np.count_nonzero(is_gap)),
+                longest_gap_s=float(interval.max()) if is_gap.any() else None,
                 unreadable=0 if table is None else table.unreadable,
                 not_read_because=survey.candidates.unread.get(channel.topic),
             )

@@ -1,4 +1,4 @@
-"""Read poses of topics without a role, which a localisation on the robot computed during the recording."""
+"""Reader of the poses in topics without a role, which a localisation on the robot computed during the recording."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ POSE_FIELDS = dict(_pose_fields())
 
 
 def scorable_topics(survey: SurveyDocument, used: Iterable[str]) -> tuple[str, ...]:
-    """Return the topics of a log with poses that are neither goals nor `used` as reference."""
-    taken = set(used)
+    """Return the topics of a log with poses, without topics of goals and the topics in `used`."""
+    excluded = set(used)
     return tuple(
         topic.topic
         for topic in survey.topics
         if topic.message_type in POSE_FIELDS
-        and topic.topic not in taken
+        and topic.topic not in excluded
         and topic.messages != 0
         and not GOAL_WORDS.search(topic.topic)
     )
@@ -67,10 +67,10 @@ def read_topic_poses(path: str | Path, topics: Sequence[str], progress: Progress
 
     Parameters
     ----------
-    path : a log, as for `icrtool.read_log`
-    topics : names of topics. A topic of type ``tf2_msgs/TFMessage`` gives the poses of the robot's base in the root
+    path : path or address of a log, as for `icrtool.read_log`
+    topics : names of topics. For a topic of type ``tf2_msgs/TFMessage``, the poses are of the robot's base in the root
         frame of the moving transforms
-    progress : called with the share of the log that has been read
+    progress : called with the share of the log that has been read, 0 to 1
 
     Raises
     ------
@@ -112,14 +112,14 @@ def _channels_of(topics: Sequence[str], channels: Sequence[Channel]) -> list[Cha
     by_topic: dict[str, list[Channel]] = {}
     for channel in channels:
         by_topic.setdefault(str(channel.topic), []).append(channel)
-    poses = [name for name, of_name in by_topic.items() if _fields_of(of_name[0])]
-    held = f"the log's poses are in {listed(poses)}" if poses else "the log has no topic of poses"
+    poses = [topic for topic, topic_channels in by_topic.items() if _fields_of(topic_channels[0])]
+    advice = f"the log has poses in {listed(poses)}" if poses else "the log has no topic with poses"
     for topic in topics:
         if topic not in by_topic:
-            raise ConfigError("score", f"the log has no topic {topic}", f"{did_you_mean(topic, poses)}{held}")
+            raise ConfigError("score", f"the log has no topic {topic}", f"{did_you_mean(topic, poses)}{advice}")
         for channel in by_topic[topic]:
             if not _fields_of(channel):
-                raise ConfigError("score", f"{topic} is a {channel.message_type}, which holds no pose", held)
+                raise ConfigError("score", f"{topic} is a {channel.message_type}, which holds no pose", advice)
             chosen.append(channel)
     return chosen
 
@@ -133,8 +133,16 @@ def _fields_of(channel: Channel) -> tuple[str, ...]:
 
 
 def _poses_of(table: TopicTable, log: Path) -> TopicPoses:
-    """Return the poses in the messages of a topic."""
-    kind = str(table.message_type)
+    """Return the poses in the messages of a topic.
+
+    Raises
+    ------
+    DefinitionError
+        The type, as the log defines it, lacks the pose.
+    DataError
+        There are fewer than two usable poses.
+    """
+    message_type = str(table.message_type)
     if table.message_type in TRANSFORM_TYPES:
         table = every_transform_pose(table)
     x, y, *q = (number_of(table, field, needed=True) for field in POSE_FIELDS[table.message_type])
@@ -147,10 +155,10 @@ def _poses_of(table: TopicTable, log: Path) -> TopicPoses:
     if len(order[rows]) < 2:
         raise DataError(log, f"{table.topic} holds {len(order[rows])} usable poses", "at least two are needed")
     ahead, left, _ = turned_axis(0, *(component[rows] / norm[rows] for component in q))
-    # Seen from above, y is left of x; in a frame with z down, y is right of x.
+    # Seen from above, the y axis is left of the x axis; in a frame whose z axis points down, it is right of it.
     side = 1.0 if frame_convention(table)[0] == "ned" else -1.0
     heading = unwrapped(np.arctan2(side * left, ahead))
     header_ns = None if stamps.header_ns is None else stamps.header_ns[rows]
     log_ns = np.maximum.accumulate(stamps.log_ns[rows])
     gap = long_intervals(np.diff(order[rows]) / 1e9)
-    return TopicPoses(str(table.topic), kind, header_ns, log_ns, x[rows] + side * 1j * y[rows], heading, gap)
+    return TopicPoses(str(table.topic), message_type, header_ns, log_ns, x[rows] + side * 1j * y[rows], heading, gap)

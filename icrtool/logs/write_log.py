@@ -1,4 +1,4 @@
-"""Write a robot log from columns: the options, the messages of each topic, and the file that holds them.
+"""Writer of robot logs: the messages of each topic from columns of sensors, and the file with these messages.
 
 `icrtool simulate`, the exports, the sample logs and the tests use this module.
 """
@@ -37,7 +37,7 @@ COMPRESSIONS: dict[ContainerKind, tuple[Compression, ...]] = {
     "bag": ("none", "bz2", "lz4"),
     "db3": ("none", "zstd", "zstd-file"),
 }
-"""Compressions of each container. For db3, ``zstd`` compresses each message, and ``zstd-file`` the closed file."""
+"""Compressions of each container. In a db3, ``zstd`` compresses each message, and ``zstd-file`` the complete file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,11 +46,12 @@ class WriteOptions:
 
     Attributes
     ----------
-    container : ``mcap`` (one ROS 2 file), ``bag`` (one ROS 1 file) or ``db3`` (a ROS 2 directory, sqlite3 storage)
-    wheels : message type of the wheels. ``float64_pair`` [m/s] and ``ticks`` (Int32, wraps) are pairs without header
+    container : ``mcap`` (one ROS 2 file), ``bag`` (one ROS 1 file) or ``db3`` (a ROS 2 directory with sqlite3 storage)
+    wheels : messages of the wheels. ``float64_pair`` [m/s] and ``ticks`` (Int32 counters that wrap around) are a topic
+        for each side, without a header
     heading : convention of the Imu. ``enu``: REP-103. ``ned``: yaw is the compass heading, body z down, and the frame
         is ``imu_link_ned`` (REP-145)
-    compression : one of `COMPRESSIONS` of the container
+    compression : compression, one of `COMPRESSIONS` for the container
     wheel_radius_m : wheel radius, for conversion of metres to radians and counts [m]
     track_width_m : track width b, for the angular velocity of a wheel controller [m]
     counts_per_rev : encoder counts of one wheel revolution
@@ -90,12 +91,12 @@ have (docs.ros.org/en/api)."""
 
 @dataclass(frozen=True, slots=True)
 class TopicMessages:
-    """All messages of a topic, serialised.
+    """The serialised messages of a topic.
 
     Attributes
     ----------
-    stamp_ns : int64 (n,)
-    payload : uint8 (n, size), a message in each row; or a list of messages if their sizes differ
+    stamp_ns : (n,) int64, log times [ns]
+    payload : (n, size) uint8, a message in each row; or a list of messages if their sizes differ
     """
 
     topic: str
@@ -106,9 +107,13 @@ class TopicMessages:
 
 @dataclass(frozen=True, slots=True)
 class TopicPlan:
-    """One topic: `fixed` values and per-message `columns`, both by dotted path (``drivers.0.measured_travel``).
+    """The values of the messages of a topic; a field without a value is zero or empty.
 
-    `stamp_ns` (n,) and each column (n,) have a row for each message. A field that is in neither is zero or empty.
+    Attributes
+    ----------
+    stamp_ns : (n,) stamps of the messages [ns]
+    fixed : values that all messages have, by path (``drivers.0.measured_travel``)
+    columns : values (n,) of each message, by path
     """
 
     topic: str
@@ -146,7 +151,7 @@ def topic_plans(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPla
         "position_covariance_type": np.where(known, 2, 0).astype(np.uint8),
     }
     receiver: dict[str, object] = {"header.frame_id": "gps_link", "status.service": 1}
-    # World and body frame change together: in ENU the body's z is up, in NED it is down (REP-145).
+    # The convention decides world and body frame: in ENU the z axis of the body points up, in NED down (REP-145).
     yaw = np.pi / 2 - columns.heading_rad if enu else columns.heading_rad
     turned = header_stamps(columns.heading_stamp_ns) | {
         "orientation.z": np.sin(yaw / 2),
@@ -166,10 +171,11 @@ def topic_plans(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPla
 
 
 def _wheel_plans(columns: SensorColumns, options: WriteOptions) -> Iterator[TopicPlan]:
+    """Yield the topics of the wheels."""
     stamps, radius = columns.wheel_stamp_ns, options.wheel_radius_m
     travel = {"left": columns.wheel_position_left_m, "right": columns.wheel_position_right_m}
     speed = {"left": columns.wheel_v_left_mps, "right": columns.wheel_v_right_mps}
-    # The twist of a wheel controller: no slip, body x forward and y left (REP-103).
+    # A wheel controller computes the twist without slip, in a body frame with x forward and y left (REP-103).
     forward, turn = (speed["right"] + speed["left"]) / 2, (speed["right"] - speed["left"]) / options.track_width_m
     changing, fixed = header_stamps(stamps), dict[str, object]()
     match options.wheels:
@@ -204,7 +210,7 @@ def _wheel_plans(columns: SensorColumns, options: WriteOptions) -> Iterator[Topi
 
 
 def header_stamps(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
-    """Return the columns of a message's header that hold its stamp."""
+    """Return the columns of the header of messages that hold their stamps (n,) [ns]."""
     return {
         "header.stamp.sec": (stamp_ns // 1_000_000_000).astype(np.uint32),
         "header.stamp.nanosec": (stamp_ns % 1_000_000_000).astype(np.uint32),
@@ -212,13 +218,18 @@ def header_stamps(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
 
 
 def serialise_topic(plan: TopicPlan, store: Typestore, *, ros1: bool = False) -> TopicMessages:
-    """Return the messages of one topic.
+    """Return the serialised messages of a topic.
 
     Parameters
     ----------
     plan : values of the messages
-    store : message types, with the definition of the type of the topic
-    ros1 : serialise in the format of ROS 1; False: CDR
+    store : definitions of message types, the type of the topic among them
+    ros1 : whether to serialise in the format of ROS 1; otherwise CDR
+
+    Raises
+    ------
+    ValueError
+        A column has another type than its field.
     """
     message = blank_message(store, plan.message_type)
     for path, value in plan.fixed.items():
@@ -231,7 +242,7 @@ def serialise_topic(plan: TopicPlan, store: Typestore, *, ros1: bool = False) ->
     blank = encode()
     payload = np.tile(blank, (len(plan.stamp_ns), 1))
     for path, values in plan.columns.items():
-        # The bytes of a message that change with a number are the bytes of this number.
+        # The bytes of the message that change with the number are the place of the number in all messages.
         _put(message, path, np.frombuffer(b"\x11" * values.itemsize, values.dtype)[0])
         changed = np.flatnonzero(encode() != blank)
         _put(message, path, values.dtype.type(0))
@@ -243,7 +254,7 @@ def serialise_topic(plan: TopicPlan, store: Typestore, *, ros1: bool = False) ->
 
 
 def blank_message(store: Typestore, message_type: str) -> object:
-    """Return a message of zeros, empty strings and empty sequences."""
+    """Return a message whose numbers are 0, and whose texts and sequences are empty."""
     from rosbags.interfaces import Nodetype
 
     values: dict[str, Any] = {}
@@ -263,6 +274,7 @@ def blank_message(store: Typestore, message_type: str) -> object:
 
 
 def _put(message: object, path: str, value: object) -> None:
+    """Set the value at a path of a message, such as ``drivers.0.measured_travel``."""
     *parents, last = path.split(".")
     for step in parents:
         message = message[int(step)] if isinstance(message, list) else getattr(message, step)
@@ -281,11 +293,11 @@ def write_mcap(
     metadata: Mapping[str, str] | None = None,
     library: str = "icrtool",
 ) -> None:
-    """Write one MCAP file of ROS 2 messages (CDR), with the definitions of the types that the store has.
+    """Write an MCAP file of ROS 2 messages (CDR), with the definitions of the types that the store has.
 
     Parameters
     ----------
-    metadata : content of the metadata record ``icrtool``
+    metadata : content of the metadata record ``icrtool``; None: no such record
     library : name of the library in the header
     """
     from mcap.writer import CompressionType, Writer
@@ -307,7 +319,7 @@ def write_mcap(
 
 
 def write_rosbag(path: Path, topics: Sequence[TopicMessages], store: Typestore, options: WriteOptions) -> None:
-    """Write one ROS 1 bag, or a ROS 2 bag directory with sqlite3 storage, as the container of the options states."""
+    """Write a ROS 1 bag, or a ROS 2 bag directory with sqlite3 storage, by `options.container`."""
     from rosbags import rosbag1, rosbag2
 
     bag: Any
@@ -327,7 +339,7 @@ def write_rosbag(path: Path, topics: Sequence[TopicMessages], store: Typestore, 
 
 
 def _in_time_order(topics: Sequence[TopicMessages]) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (index of the topic, stamp, message) by stamp; messages of equal stamps in the order of the topics."""
+    """Yield index of the topic, stamp [ns] and bytes of each message, sorted by stamp and then by topic."""
     if not topics:
         return
     stamps = np.concatenate([topic.stamp_ns for topic in topics])
@@ -340,27 +352,24 @@ def _in_time_order(topics: Sequence[TopicMessages]) -> Iterator[tuple[int, int, 
 
 
 def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -> Path:
-    """Write `columns` as the log a robot would have recorded, in ROS conventions (REP-103, or REP-145 NED).
+    """Write columns of sensors as a log in ROS conventions (REP-103, or REP-145 for NED), and return `path`.
+
+    The log is written under another name in the same folder, and renamed when it is complete.
 
     Parameters
     ----------
-    path : the file to make (``mcap``, ``bag``), or the directory (``db3``); it must not exist
-    columns : sensor columns in the frames of `icrtool`
+    path : path of the file (``mcap``, ``bag``) or of the directory (``db3``); it must not exist
+    columns : columns of the sensors in the frames of `icrtool`
     options : container, message types and conventions
-
-    Returns
-    -------
-    `path`
 
     Raises
     ------
     OutputError
-        `path` exists or cannot be written. No incomplete file stays, because the log is written under another name in
-        the same folder, and renamed when it is complete.
+        `path` exists, or cannot be written.
 
     Notes
     -----
-    Log time is the stamp. Topics: ``/imu/data``, ``/gps/fix``, and by `options.wheels` ``/joint_states``,
+    Log times equal the stamps. Topics: ``/imu/data``, ``/gps/fix``, and by `options.wheels` ``/joint_states``,
     ``/wheel_controller/odom``, ``/wheel_controller/twist``, ``/feedback``, ``/left_drive/velocity`` with
     ``/right_drive/velocity``, or ``/lwheel_ticks`` with ``/rwheel_ticks``.
     """

@@ -177,7 +177,7 @@ class Verdict(Gate, frozen=True, kw_only=True):
             length = f" of {self.horizon_m:g} m" if self.horizon_m is not None else ""
             return f"{word}  {self.text}: no trial{length} in this log{log}"
         numbers = (self.margin_m, self.value_bound_m, self.baseline_m)
-        margin_m, bound_m, baseline_m = (math.nan if one is None else one for one in numbers)
+        margin_m, bound_m, baseline_m = (math.nan if number is None else number for number in numbers)
         bound = f"margin {margin_m:+.3g} m"
         if self.relative:
             interval = ", no interval"

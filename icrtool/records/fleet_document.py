@@ -145,7 +145,7 @@ class FleetLog(Record, frozen=True):
     @property
     def codes(self) -> tuple[str, ...]:
         """The codes of the log's findings, each once."""
-        return tuple(dict.fromkeys(one.code for one in self.notes))
+        return tuple(dict.fromkeys(finding.code for finding in self.notes))
 
     def shown_error(self, *, baseline: bool = False) -> float | None:
         """Return the error [m] that stands for the log, or for its baseline."""

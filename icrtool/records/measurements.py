@@ -142,7 +142,9 @@ class SensorData:
         stamps = self.wheels.stamp_ns
         turning = np.empty(len(stamps), np.bool_)
         for lo in range(0, len(stamps), ROWS_AT_ONCE):
-            left, right = (one[lo : lo + ROWS_AT_ONCE] for one in (self.wheels.v_left_mps, self.wheels.v_right_mps))
+            left, right = (
+                speeds[lo : lo + ROWS_AT_ONCE] for speeds in (self.wheels.v_left_mps, self.wheels.v_right_mps)
+            )
             turning[lo : lo + len(left)] = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
         near = 0
         if len(stamps) > 1:

@@ -65,7 +65,7 @@ def note(code: str, text: str, subject: str = "") -> Note:
 def notes_about(subject: str, notes: Iterable[Note]) -> tuple[Note, ...]:
     """Return the findings with `subject`, the name of a log or file, as their subject."""
     plain = str.__str__(subject)
-    return tuple(msgspec.structs.replace(one, subject=plain) for one in notes)
+    return tuple(msgspec.structs.replace(finding, subject=plain) for finding in notes)
 
 
 def is_grave(note: Note) -> bool:
@@ -75,12 +75,12 @@ def is_grave(note: Note) -> bool:
 
 def warnings_of(notes: Iterable[Note]) -> tuple[str, ...]:
     """Return the sentences of the findings that are not grave; `unusable_because` returns the grave ones."""
-    return tuple(one.sentence for one in notes if not is_grave(one))
+    return tuple(finding.sentence for finding in notes if not is_grave(finding))
 
 
 def unusable_because(notes: Iterable[Note]) -> str | None:
     """Return the texts of the grave findings in one line; None where there is none: the numbers may be used."""
-    return "; ".join(one.text for one in notes if is_grave(one)) or None
+    return "; ".join(finding.text for finding in notes if is_grave(finding)) or None
 
 
 def first_to_read(notes: Sequence[Note]) -> Note | None:
@@ -90,5 +90,5 @@ def first_to_read(notes: Sequence[Note]) -> Note | None:
 
 def gravest(notes: Iterable[Note]) -> list[Note]:
     """Return the findings that are not grave, the highest grade first; findings of one grade keep their order."""
-    shown = [one for one in notes if not is_grave(one)]
-    return sorted(shown, key=lambda one: -GRADES.index(one.grade))
+    shown = [finding for finding in notes if not is_grave(finding)]
+    return sorted(shown, key=lambda finding: -GRADES.index(finding.grade))

@@ -305,7 +305,7 @@ def without_secrets(url: str) -> str:
 def _secrets_of(url: str) -> list[str]:
     """Return the secret parts of an address, as written, escaped and without escapes, the longest first."""
     _, known, _, behind = _parts(url)
-    whole = {one for text in (known, behind) for one in (text, unquote(text), unquote_plus(text), quote(text))}
+    whole = {form for text in (known, behind) for form in (text, unquote(text), unquote_plus(text), quote(text))}
     # a library may show pieces of the secrets
     pieces = whole | {piece for text in whole for piece in re.split(r"[^\w.~-]+", text)}
-    return sorted((one for one in pieces if len(one) >= _LEAST_SECRET), key=len, reverse=True)
+    return sorted((piece for piece in pieces if len(piece) >= _LEAST_SECRET), key=len, reverse=True)

@@ -149,7 +149,7 @@ def turned_by(name: str) -> str:
     """
     if name.startswith(f"{TOPIC_ROW}:"):
         return ""
-    return next((one for one in TURNED_BY if name.endswith(f"_{one}")), "")
+    return next((suffix for suffix in TURNED_BY if name.endswith(f"_{suffix}")), "")
 
 
 def base_of(name: str) -> str:

@@ -157,7 +157,7 @@ class Run:
                 values = -values
             columns[str(name).replace(plain_name, names.get(plain_name, plain_name))] = values
         first = ("stamp_ns", "t_s", "x_m", "y_m")
-        return type(table)({name: columns[name] for name in (*first, *(one for one in columns if one not in first))})
+        return type(table)({name: columns[name] for name in (*first, *(name for name in columns if name not in first))})
 
     @property
     def name(self) -> str:
@@ -248,7 +248,7 @@ class Run:
         fitted to speeds with the factors of this function, and estimate the scales of tyres and soil.
         """
         left, right = (
-            1.0 if not one or abs(abs(one) - 1.0) <= ROLLING_SCALE else abs(one) for one in self.wheel_scales
+            1.0 if not scale or abs(abs(scale) - 1.0) <= ROLLING_SCALE else abs(scale) for scale in self.wheel_scales
         )
         return left, right
 

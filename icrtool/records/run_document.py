@@ -126,7 +126,10 @@ class IcrDocument(Record, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_together(self, "separation_multiplier", "separation_multiplier_std")
         for name in NumberByIcr.__struct_fields__:
-            if len({getattr(one, name) is None for one in (self.final, self.final_std, self.mean, self.std)}) > 1:
+            if (
+                len({getattr(numbers, name) is None for numbers in (self.final, self.final_std, self.mean, self.std)})
+                > 1
+            ):
                 raise ValueError(f"only some of final, final_std, mean and std are known of {name}")
 
 

@@ -148,7 +148,7 @@ def with_interval(metres: float, low: float | None, high: float | None) -> str:
     """Return a difference [m] with its 95 % interval, as ``+0.01 m (-0.05 to +0.07)``."""
     if low is None or high is None:
         return f"{metres:+z.2f} m (too short for an interval)"
-    value, low_text, high_text = (f"{one:+z.{digits_of((high - low) / 4)}f}" for one in (metres, low, high))
+    value, low_text, high_text = (f"{number:+z.{digits_of((high - low) / 4)}f}" for number in (metres, low, high))
     return f"{value} m ({low_text} to {high_text})"
 
 

@@ -56,7 +56,7 @@ def results(request, stage):
     if request.files.page:
         (directory / "report.html").touch()
     return replace(request.known, status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
-                   inputs=one_log.files_of(path))
+                   inputs=one_log.hashed_files(path))
 
 one_log._results = results
 processes.main()
@@ -275,10 +275,10 @@ def test_what_cannot_be_planned_is_refused_at_once(season: Path, tmp_path: Path)
     with pytest.raises(ConfigError, match="gate"):
         plan_requests([season], tmp_path / "out", BatchRequest(report=ReportRequest(gates=("nonsense",))))
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="a file is there"):
+    with pytest.raises(OutputError, match="is a file"):
         plan_requests([season], tmp_path / "file", BatchRequest())
     (tmp_path / "run.json").touch()
-    with pytest.raises(OutputError, match="is a run itself"):
+    with pytest.raises(OutputError, match="is the directory of a run"):
         plan_requests([season], tmp_path, BatchRequest())
 
 

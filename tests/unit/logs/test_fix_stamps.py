@@ -59,7 +59,7 @@ def test_fixes_in_bursts_or_of_one_stamp_show_the_icrs(
     assert run.usable
     assert shows_the_icrs(run)
     (named,) = (one.text for one in run.notes if one.code == "fix_bursts")
-    words = f"fixes arrive in bursts of {samples}, {samples * 200} ms" if arrival else f"{samples} at a time"
+    words = f"fixes arrive in bursts of {samples}, {samples * 200} ms" if arrival else f"in groups of {samples}"
     assert words in named
     # the delay that is left is that of the clocks, which agree
     assert run.document.filter.reference_delay_s == pytest.approx(0.0, abs=0.05)

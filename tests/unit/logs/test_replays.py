@@ -96,7 +96,7 @@ def test_a_replay_in_a_loop_is_one_pass_and_named(tmp_path: Path, once: RobotLog
         return [BEGIN_NS + one for one in at if one < passes * LASTS_NS]
 
     log = read_log(record(tmp_path / "a.mcap", times), CONFIG)
-    assert "a replay in a loop; the first pass is used" in codes(log)["recording_looped"]
+    assert "a replay in a loop was recorded; the first pass is used" in codes(log)["recording_looped"]
     assert_same(log, once)
 
 
@@ -131,7 +131,7 @@ def test_a_replay_at_another_speed_has_the_clock_of_its_headers_and_is_named(
 ) -> None:
     log = read_log(record(tmp_path / "a.mcap", lambda t: [BEGIN_NS + round(t / speed)]), CONFIG)
     assert_same(log, once)
-    assert f"goes {speed:.3g} times as fast as log time" in codes(log)["header_clock"]
+    assert f"runs {speed:.3g} times as fast as log time" in codes(log)["header_clock"]
     assert all(stream.clock == "header" for stream in log.streams)
 
 
