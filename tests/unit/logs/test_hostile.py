@@ -625,7 +625,7 @@ def test_of_ever_new_names_the_first_thousands_are_told_apart() -> None:
 
 
 def test_joints_at_infinity_are_left_out() -> None:
-    from icrtool.logs.streams.assembly import wheel_samples
+    from icrtool.logs.streams.wheel_samples import wheel_samples
 
     rows = [(START_NS + i * 10**8, [0.1 * i, 0.1 * i if i % 4 else np.inf * (-1) ** i]) for i in range(100)]
     messages = [(stamp, joints(stamp, WHEELS, positions)) for stamp, positions in rows]

@@ -11,9 +11,9 @@ from icrtool.config import Config, load_config
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import drive
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.assembly import wheel_samples
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.sources import WheelSource
+from icrtool.logs.streams.wheel_samples import wheel_samples
 from icrtool.logs.streams.wheels import pose_travel
 from support.tables import table_of
 

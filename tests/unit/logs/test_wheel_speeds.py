@@ -9,8 +9,8 @@ from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.assembly import wheel_samples
 from icrtool.logs.streams.sources import StampedRows, WheelSource, make_wheel_source
+from icrtool.logs.streams.wheel_samples import wheel_samples
 from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog
 from support.tables import read_source
