@@ -1,1 +1,1 @@
-"""From a log as recorded to measurements that fit together: wheels, heading, delays, GNSS quality."""
+"""Alignment of the streams of a log: units, sides, heading, delays and GNSS quality are found and corrected."""

@@ -1,4 +1,4 @@
-"""Align the sensors of a log: correct its streams for the filter, and choose its position reference."""
+"""Alignment of the sensors of a log: its streams corrected for the filter, and the choice of its position reference."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     """
     configured_shifts = NO_SHIFTS
     if config.filter.rules.corrects:
-        # The delays come first: all later steps compare the streams.
+        # Delays are corrected first, because all later steps compare the streams.
         log, config, configured_shifts = with_configured_delays(log, config)
         log = without_interpolated(log)
     log = with_wheel_speeds(log, config)
@@ -69,7 +69,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     measurements = _align_once(log, config)
     disagreements = find_disagreements(measurements.sensors, width)
     if disagreements.events:
-        # Aligned again without the events, where the rest of the drive is long enough.
+        # The log is aligned again without the events, if the rest of the drive is long enough.
         with suppress(DataError):
             spans = tuple((event.begin_ns, event.end_ns) for event in disagreements.events)
             measurements = _align_once(replace(log, slipping_ns=spans), config)
@@ -83,7 +83,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
 
 
 def _with_size(found: Measurements, factor: float) -> Measurements:
-    """Return measurements whose scales include a factor by which the wheel speeds were multiplied before."""
+    """Return measurements whose wheel scales include the factor by which `with_right_size` multiplied the speeds."""
     if factor == 1.0:
         return found
     facts = found.wheels
@@ -109,6 +109,7 @@ def _with_size(found: Measurements, factor: float) -> Measurements:
 
 
 def _align_once(log: RobotLog, config: Config) -> Measurements:
+    """Return the measurements of a log with wheel speeds in m/s, without slip events and jumps; raise as `align`."""
     streams = align_streams(log, config)
     heading, derived = streams.heading, streams.derived
     fix_steps, heading_steps = streams.steps()
@@ -154,7 +155,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
 
 
 def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
-    """Return the streams of a log without any correction, each sample with its noise: for logs known to be right.
+    """Return the streams of a log without any correction, with the noise of each sample, as for simulated logs.
 
     Raises
     ------
@@ -188,14 +189,17 @@ def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
 
 
 NOT_A_CORRECTION = "compared with the filter's ICRs"
+"""Reason in findings about ICRs, which correct no stream."""
 
 
 def alignment_findings(streams: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
-    """Return all estimates of the alignment, by name with unit; side scales and ICRs where they were estimated.
+    """Return all estimates of the alignment by their names, which end with the unit.
+
+    Without a fit there are no scales of single sides and no ICRs.
 
     Parameters
     ----------
-    antenna_m : the antenna from the body origin, forward and right; the ICRs refer to the origin
+    antenna_m : position of the antenna in the body frame, forward and right [m]; ICRs refer to the body origin
     """
     wheels, heading, delays = streams.wheels, streams.heading, streams.delays
     offset = None if heading.offset_deg is None else -heading.offset_deg
@@ -228,7 +232,14 @@ def alignment_findings(streams: AlignedStreams, antenna_m: tuple[float, float]) 
 
 
 def _finding(value: float | None, std: float | None, applied: float, nothing: float = 0.0) -> Finding:
-    """Return one estimate; None or not finite: not known; `nothing` is the value of `applied` without a correction."""
+    """Return a finding about an estimate.
+
+    Parameters
+    ----------
+    value, std : estimate and its standard deviation; None or not finite if they are not known
+    applied : the correction that was applied
+    nothing : value of `applied` without a correction
+    """
     if value is None or std is None or not math.isfinite(value + std):
         value = std = None
     if applied != nothing:
@@ -244,26 +255,26 @@ LENGTH_M = 10.0
 """Length of the windows in which references are compared [m]."""
 
 SHARE = 0.9
-"""Quantile of the residuals in these windows, by which references are compared."""
+"""Quantile of the residuals in these windows by which references are compared."""
 
 POOR_M = 1.0
-"""Residual below which the chosen reference is kept [m]. GNSS gives positions on the globe and does not drift."""
+"""Residual up to which the chosen reference is kept [m]. Positions of GNSS are geodetic and do not drift."""
 
 BETTER_RESIDUAL_RATIO = 0.5
-"""Ratio of the residuals of another and of the chosen reference below which the other one may be taken."""
+"""Largest ratio of the residual of another reference to the residual of the chosen one with which it may replace it."""
 
 LEAST_SHARE_COVERED = 0.7
-"""Smallest ratio of the distance that another reference covers to the distance that the chosen one covers. With less,
-the other reference is not taken."""
+"""Smallest ratio of the distance that another reference covers to the distance that the chosen one covers, with which
+it may replace it."""
 
 
 class Agreement(NamedTuple):
-    """How a position reference agrees with wheels and heading.
+    """Agreement of a position reference with wheels and heading.
 
     Attributes
     ----------
-    residual_m : `SHARE` quantile of the residuals of displacements over `LENGTH_M`, inf where there is none
-    distance_m : driven distance that windows cover
+    residual_m : quantile `SHARE` of the residuals of displacements over `LENGTH_M` [m]; inf if they cannot be compared
+    distance_m : driven distance that the windows cover [m]
     """
 
     residual_m: float
@@ -299,7 +310,7 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
 
 
 def measure_agreement(log: RobotLog, config: Config) -> Agreement:
-    """Return how the position reference of a log agrees with its wheels along its heading."""
+    """Return the agreement of the position reference of a log with its wheels and headings."""
     width = width_or_usual_m(config.robot.track_width_m)
     log, config, _ = with_configured_delays(log, config)
     try:

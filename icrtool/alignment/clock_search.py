@@ -1,4 +1,4 @@
-"""Streams that are stamped wrongly by seconds: configured delays, and delays that correlations of speeds show."""
+"""Correction of streams whose stamps are wrong by seconds: configured delays, and delays by correlation of speeds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from icrtool.records.samples import GyroAxes
 from icrtool.records.tables import RobotLog
 
 LONGEST_SHIFT_S, SHORTEST_SHIFT_S = 30.0, 3.0
-"""Largest shift that is searched, and smallest shift that is corrected [s]. The alignment itself finds smaller ones."""
+"""Largest shift that is searched, and smallest shift that is corrected [s]. The estimate of the alignment finds smaller
+delays."""
 
 GRID_S, MOST_STEPS = 0.1, 100_000
 """Step of the search [s], and largest number of steps of a drive that are compared."""
@@ -28,34 +29,34 @@ SPEED_OVER_S = 1.0
 """Time over which speeds and turn rates are averaged [s]. Noise of fixes hides faster changes."""
 
 INDEPENDENT_S = 4.0
-"""Time between two speeds of a robot from which on they count as independent [s]."""
+"""Time after which two speeds of a robot count as independent [s]."""
 
 DECISIVE_GAIN, RIVAL_GAIN, RIVAL_S = 25.0, 9.0, 3.0
-"""Gains in twice the log-likelihood that a shift needs: over no shift, and over any other shift that is further away
-than the third value [s]. A drive that repeats itself shows no shift."""
+"""Smallest gain in twice the log-likelihood over no shift, smallest gain over a rival, and smallest distance of a rival
+from the shift [s]. A drive that repeats itself has rivals, and shows no shift."""
 
 LEAST_CORRELATION = 0.8
 """Smallest correlation of two speeds of one robot. With less, no shift is found."""
 
 LARGEST_R2 = 0.98
-"""Upper limit of a squared correlation. A robot follows its wheels with a small, varying delay, so that a larger value
-has no further meaning."""
+"""Upper limit of a squared correlation. A robot follows its wheels with a small, varying delay, so that larger values
+do not mean a better shift."""
 
 LEAST_CHANGE = 1e-3
 """Smallest variance of the values that overlap at a lag, as a share of the variance of the whole column. With a smaller
 variance the rounding errors of Fourier transforms are too large, and the correlation is computed directly."""
 
 LEAP_S = 18.0
-"""Time by which GPS time is ahead of UTC since 2017 [s]."""
+"""Difference of GPS time minus UTC since 2017 [s]."""
 
 
 class Shifts(NamedTuple):
-    """Times by which streams are stamped later than the wheels [s], already subtracted from the stamps.
+    """Times by which streams were stamped later than the wheels, already subtracted from their stamps.
 
     Attributes
     ----------
-    gnss, heading : times of positions and of headings; 0 for a stream that was not moved
-    notes : the findings
+    gnss, heading : shift of the positions and of the headings [s]; 0 for a stream that was not moved
+    notes : findings about shifts that were found
     """
 
     gnss: float
@@ -88,10 +89,10 @@ def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Con
 
 
 def _moved(log: RobotLog, config: Config, gnss_s: float, heading_s: float) -> RobotLog:
-    """Return a log whose fixes and headings are stamped earlier by some seconds.
+    """Return a log with the stamps of fixes and headings reduced by some seconds.
 
-    Turn rates in the messages of the headings are moved by the same time, because they have the same clock. They are
-    not moved by `SHORTEST_SHIFT_S` or less: such a shift may be the delay of a filter that only the headings pass.
+    Turn rates in the messages of the headings have the same clock and are moved with them. A shift of
+    `SHORTEST_SHIFT_S` or less does not move them, because it may be the delay of a filter for headings alone.
     """
     moved: dict[str, Any] = {
         name: replace(stream, stamp_ns=stream.stamp_ns - round(by * 1e9))
@@ -104,18 +105,18 @@ def _moved(log: RobotLog, config: Config, gnss_s: float, heading_s: float) -> Ro
 
 
 def _with_gyros_moved(log: RobotLog, by_s: Mapping[str, float]) -> RobotLog:
-    """Return a log whose turn rates are stamped earlier by some seconds for each topic."""
+    """Return a log with the stamps of turn rates reduced by some seconds for each topic."""
 
-    def at(stamp_ns: Ints, topic: str) -> Ints:
+    def moved(stamp_ns: Ints, topic: str) -> Ints:
         return stamp_ns - round(by_s.get(topic, 0.0) * 1e9)
 
-    gyros = tuple(replace(gyro, stamp_ns=at(gyro.stamp_ns, gyro.topic)) for gyro in log.gyros)
-    gyro = None if log.gyro is None else replace(log.gyro, stamp_ns=at(log.gyro.stamp_ns, log.gyro.topic))
+    gyros = tuple(replace(gyro, stamp_ns=moved(gyro.stamp_ns, gyro.topic)) for gyro in log.gyros)
+    gyro = None if log.gyro is None else replace(log.gyro, stamp_ns=moved(log.gyro.stamp_ns, log.gyro.topic))
     return replace(log, gyros=gyros, gyro=gyro)
 
 
 def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts]:
-    """Return a log whose streams are moved by their configured delays, or by delays that their speeds show.
+    """Return a log whose streams are moved by their configured delays, or by shifts that their speeds show.
 
     Returns
     -------
@@ -148,7 +149,7 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
 
 
 def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Finding]:
-    """Return the findings of a log whose streams were moved, counted from the stamps that were sent."""
+    """Return findings in which the delays of moved streams are relative to the stamps that were sent."""
     by = {
         "position_delay_s": shifts.gnss,
         "heading_delay_s": shifts.heading,
@@ -163,16 +164,16 @@ def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Findi
 
 
 def _sentence(word: str, shift_s: float, key: str) -> str:
-    """Return the finding about a stream's clock, and the correction."""
+    """Return a sentence about the shift of a stream and its correction."""
     subject = {"gnss": "positions", "heading": "headings"}.get(word, "the turn rates of the gyro")
     fact = f"{subject} are stamped {abs(shift_s):.1f} s {'later' if shift_s > 0 else 'earlier'} than the wheels"
     leap = abs(abs(shift_s) - LEAP_S) < 2 * GRID_S
-    cause = " (GPS time is 18 s ahead of UTC)" if leap else ""
-    return f"{fact}, as their speeds show: their clock{cause}; corrected; frames.{key} sets it"
+    cause = "GPS time is 18 s ahead of UTC" if leap else "another clock"
+    return f"by the correlation of their speeds, {fact} ({cause}): corrected; frames.{key} sets the delay"
 
 
 def _can_be_compared(log: RobotLog) -> bool:
-    """Return whether wheels and positions hold at least two finite values each; other faults are refused later."""
+    """Return whether wheels and positions have two finite values each, in order; later steps refuse other logs."""
     wheels, gnss = log.wheels, log.gnss
     if min(len(wheels.stamp_ns), len(gnss.stamp_ns)) < 2:
         return False
@@ -182,13 +183,17 @@ def _can_be_compared(log: RobotLog) -> bool:
 
 
 class _Rates(NamedTuple):
-    """Speed [m/s] and turn rate [rad/s] on the grid of a log; NaN where not known, None where a stream shows none."""
+    """Speed [m/s] and turn rate [rad/s] of a stream at the times of `_grid` (n,).
+
+    A value is NaN where it is not known; a column is None if the stream does not show it.
+    """
 
     speed: Floats | None
     turn: Floats | None
 
     @classmethod
     def of_wheels(cls, log: RobotLog) -> _Rates:
+        """Return speed and turn rate of the wheels."""
         wheels = log.wheels
         held = np.diff(wheels.stamp_ns, append=wheels.stamp_ns[-1:]) / 1e9
         left, right = (
@@ -200,15 +205,16 @@ class _Rates(NamedTuple):
 
     @classmethod
     def of_fixes(cls, log: RobotLog) -> _Rates:
+        """Return speed, and turn rate of the course over ground, of the fixes."""
         gnss = log.gnss
         if len(gnss.stamp_ns) < 2:
             return cls(None, None)
         velocity = _rate(gnss.stamp_ns, gnss.north_m, log) + 1j * _rate(gnss.stamp_ns, gnss.east_m, log)
         speed, known = np.abs(velocity), _known(gnss.stamp_ns, log)
-        # a jump of the positions has no speed, and would outweigh all others
+        # Jumps of the positions are left out, because their speeds would outweigh all others.
         jumps = speed > FASTER * max(float(np.abs(side).max()) for side in (log.wheels.left, log.wheels.right))
         known, velocity = known & ~jumps, np.where(jumps, np.nan, velocity)
-        # a robot on the spot has no course over ground
+        # Slow motion is left out, because its course over ground is mostly noise.
         step = max(round(SPEED_OVER_S / GRID_S), 1)
         turned = np.angle(velocity[step:] * np.conj(velocity[:-step])) / SPEED_OVER_S
         turn = np.full(len(speed), np.nan)
@@ -218,6 +224,7 @@ class _Rates(NamedTuple):
 
     @classmethod
     def of_headings(cls, log: RobotLog) -> _Rates:
+        """Return the turn rate of the headings."""
         heading = log.heading
         if len(heading.stamp_ns) < 2:
             return cls(None, None)
@@ -226,7 +233,7 @@ class _Rates(NamedTuple):
 
     @classmethod
     def of_gyro(cls, gyro: GyroAxes, log: RobotLog) -> _Rates:
-        """Return the turn rate about the gyro axis with the most turn."""
+        """Return the turn rate about the axis of a gyro that turns most."""
         if len(gyro.stamp_ns) < 2:
             return cls(None, None)
         t = (gyro.stamp_ns - gyro.stamp_ns[0]) / 1e9
@@ -237,7 +244,7 @@ class _Rates(NamedTuple):
 
 
 def _grid(log: RobotLog) -> Ints:
-    """Return the times of the grid [ns]: the time span of the wheels, extended by the largest shift on both sides."""
+    """Return the times of the grid (n,) [ns]: the span of the wheels, extended by the largest shift on both sides."""
     first, last = int(log.wheels.stamp_ns[0]), int(log.wheels.stamp_ns[-1])
     count = min(int((last - first) / (GRID_S * 1e9)) + 1, MOST_STEPS)
     around = round(LONGEST_SHIFT_S / GRID_S)
@@ -245,7 +252,7 @@ def _grid(log: RobotLog) -> Ints:
 
 
 def _rate(stamps: Ints, values: Floats, log: RobotLog) -> Floats:
-    """Return the mean change per second of a column over `SPEED_OVER_S` around each time of the grid."""
+    """Return the change of a column per second at each time of the grid, as the mean over `SPEED_OVER_S`."""
     grid, half = _grid(log), round(SPEED_OVER_S * 1e9 / 2)
     t = (stamps - grid[0]) / 1e9
     first, last = ((grid - grid[0] + shift) / 1e9 for shift in (-half, half))
@@ -253,7 +260,7 @@ def _rate(stamps: Ints, values: Floats, log: RobotLog) -> Floats:
 
 
 def _known(stamps: Ints, log: RobotLog) -> Bools:
-    """Return at which times of the grid a stream was sampled just before and just after."""
+    """Return a mask of the times of the grid at which a stream was sampled shortly before and after."""
     grid, usual = _grid(log), float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     after = np.searchsorted(stamps, grid)
     inside = (after > 0) & (after < len(stamps))
@@ -262,12 +269,14 @@ def _known(stamps: Ints, log: RobotLog) -> Bools:
 
 
 def find_shift(wheels: _Rates, stream: _Rates) -> float:
-    """Return the time by which a stream is stamped later than the wheels [s]; 0 where it is below 3 s, or not shown.
+    """Return the time by which a stream is stamped later than the wheels [s].
+
+    It is 0 if the streams do not show it, or if it is `SHORTEST_SHIFT_S` or less.
 
     Notes
     -----
-    Twice the log-likelihood of a line through n independent pairs is -n log(1 - r^2): the correlations of speeds and of
-    turn rates add up. Their signs do not count: sides may be exchanged.
+    Twice the log-likelihood of a line through n independent pairs is -n log(1 - r^2), summed over the correlations r of
+    speeds and of turn rates. The signs of r have no effect, because sides may be exchanged.
     """
     lags = np.arange(-round(LONGEST_SHIFT_S / GRID_S), round(LONGEST_SHIFT_S / GRID_S) + 1)
     gain, best_r = np.zeros(len(lags)), np.zeros(len(lags))
@@ -275,7 +284,7 @@ def find_shift(wheels: _Rates, stream: _Rates) -> float:
         if wheel_rate is None or stream_rate is None:
             continue
         r2, count = _correlations(wheel_rate, stream_rate, lags)
-        # the same number of pairs for all lags: a longer overlap of streams is no evidence of a lag
+        # All lags get the same number of pairs, because a longer overlap of the streams is no evidence of a lag.
         gain -= count.max() * GRID_S / INDEPENDENT_S * np.log1p(-np.minimum(r2, LARGEST_R2))
         best_r = np.maximum(best_r, np.sqrt(r2))
     at = int(gain.argmax())
@@ -296,28 +305,29 @@ def _correlations(column: Floats, later_column: Floats, lags: Ints) -> tuple[Flo
 
     Notes
     -----
-    The sums over pairs of all lags are six cross-correlations, by Fourier transforms (Padfield 2012, "Masked
-    Object Registration in the Fourier Domain"). A lag at which a column hardly changes is computed by its pairs alone.
+    The sums over the pairs of all lags are six cross-correlations, computed by Fourier transforms (Padfield 2012,
+    "Masked Object Registration in the Fourier Domain"). For a lag at which a column hardly changes, the correlation is
+    computed directly.
     """
     size = 1 << (len(column) + int(np.abs(lags).max(initial=0))).bit_length()
-    of_own, of_seen = (np.fft.rfft(_powers(column), size) for column in (column, later_column))
+    spectra, later_spectra = (np.fft.rfft(_powers(values), size) for values in (column, later_column))
 
-    def sums(own_power: int, seen_power: int) -> Floats:
-        return np.asarray(np.fft.irfft(np.conj(of_own[own_power]) * of_seen[seen_power], size)[lags])
+    def sums(power: int, later_power: int) -> Floats:
+        return np.asarray(np.fft.irfft(np.conj(spectra[power]) * later_spectra[later_power], size)[lags])
 
     counts = np.rint(sums(0, 0))
     pairs = np.maximum(counts, 1.0)
-    own_mean, seen_mean = sums(1, 0) / pairs, sums(0, 1) / pairs
-    own_change, seen_change = sums(2, 0) / pairs - own_mean**2, sums(0, 2) / pairs - seen_mean**2
-    clear = (counts > 2) & (np.minimum(own_change, seen_change) > LEAST_CHANGE)
-    found = np.zeros(len(lags))
-    together = sums(1, 1) / pairs - own_mean * seen_mean
-    found[clear] = together[clear] ** 2 / (own_change[clear] * seen_change[clear])
-    # A few pairs at the ends of the columns may correlate by chance.
+    mean, later_mean = sums(1, 0) / pairs, sums(0, 1) / pairs
+    variance, later_variance = sums(2, 0) / pairs - mean**2, sums(0, 2) / pairs - later_mean**2
+    varies = (counts > 2) & (np.minimum(variance, later_variance) > LEAST_CHANGE)
+    squared = np.zeros(len(lags))
+    covariance = sums(1, 1) / pairs - mean * later_mean
+    squared[varies] = covariance[varies] ** 2 / (variance[varies] * later_variance[varies])
+    # Lags with few pairs are left out, because these may correlate by chance.
     enough = counts >= 0.5 * counts.max(initial=0.0)
-    for row in np.flatnonzero(enough & ~clear):
-        found[row] = _correlation(column, later_column, int(lags[row]))
-    return np.where(enough, found, 0.0), counts
+    for row in np.flatnonzero(enough & ~varies):
+        squared[row] = _correlation(column, later_column, int(lags[row]))
+    return np.where(enough, squared, 0.0), counts
 
 
 def _powers(column: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Which side is which, in which sense a heading turns: hypotheses compared by their likelihood.
+"""Choice of the sides of the wheels and of the senses of heading and positions: hypotheses compared by likelihood.
 
 Displacements of windows are linear in two integrals along the measured heading, p = Z_v ∫v e^{j psi} + Z_u ∫u e^{j psi}
 where v is the mean of the sides' speeds and u half their difference. Heading changes are linear in ∫u and ∫v. Sides
@@ -44,7 +44,7 @@ EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
 the turn about 1 (largest coefficient), the asymmetry about 0."""
 
 DECISIVE = 25.0
-"""Twice the gain in log-likelihood from which on a hypothesis is preferred to the names in the log: 5 sigma."""
+"""Twice the gain in log-likelihood above which a hypothesis is preferred to the names in the log, 5 sigma."""
 
 VAGUE_PRIOR_STD = 10.0
 """Prior standard deviation of the fit's parameters, which are near 1. It has hardly any effect."""
@@ -57,20 +57,20 @@ common fault; two joints or topics with exchanged names are rarer."""
 
 ABOUT_RAD = math.radians(135.0)
 BACKWARDS_SHARE = 0.8
-"""Share of the distance with wheels going backwards from which on a hypothesis has a fault. Robots are driven
-forward."""
+"""Share of the distance driven backwards above which a hypothesis has a fault. Robots are mostly driven forward."""
 
 CHORD_IN_POSITION_STD = 4.0
 """Smallest chord that is compared without a heading, in standard deviations of the position."""
 
 
 class Convention(NamedTuple):
-    """One hypothesis.
+    """A hypothesis about sides and senses.
 
     Attributes
     ----------
-    swapped : sides are exchanged; sign_left, sign_right : signs of the named sides, before they are exchanged
-    heading, position : +1, or -1 where mirrored
+    swapped : whether the sides are exchanged
+    sign_left, sign_right : signs of the named sides, before they are exchanged
+    heading, position : +1, or -1 if mirrored
     """
 
     swapped: bool
@@ -80,7 +80,13 @@ class Convention(NamedTuple):
     position: int
 
     def faults(self, offset: float, track: Track, gyro_sense: int) -> float:
-        """Return the number of faults, weighted by `FAULTS`; `gyro_sense` as in `decide_conventions`."""
+        """Return the number of faults of the hypothesis, weighted by `FAULTS`.
+
+        Parameters
+        ----------
+        offset : offset of the heading by this hypothesis [rad]
+        gyro_sense : as in `decide_conventions`
+        """
         count = FAULTS["swapped"] * self.swapped
         signs = self.sign_left + self.sign_right
         count += FAULTS["one side reversed"] * (signs == 0) + FAULTS["both reversed"] * (signs == -2)
@@ -88,7 +94,7 @@ class Convention(NamedTuple):
             count += FAULTS["pose mirrored"]
         else:
             count += FAULTS["heading mirrored"] * (self.heading < 0) + FAULTS["position mirrored"] * (self.position < 0)
-            # an ENU yaw that is read as a NED yaw, or the reverse, is also turned by 90 deg
+            # An ENU yaw that is read as a NED yaw, or the reverse, is also turned by 90 deg.
             if self.heading < 0 and not track.same_clock:
                 offset = math.remainder(offset - math.pi / 2, 2 * math.pi)
         count += FAULTS["turned about"] * (abs(offset) > ABOUT_RAD)
@@ -99,10 +105,11 @@ class Convention(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """The convention that was chosen.
+    """The chosen convention.
 
     Attributes
     ----------
+    convention : the chosen convention
     as_likely : another convention with the same likelihood and at most half a fault more; None without one
     """
 
@@ -114,7 +121,14 @@ AS_NAMED = Convention(swapped=False, sign_left=1, sign_right=1, heading=1, posit
 
 
 class _Shown(NamedTuple):
-    """Fit for one handedness: Z (re v, im v, re u, im u), turn by u and by v, covariances, residuals."""
+    """Fit of displacements and turns for one handedness.
+
+    Attributes
+    ----------
+    z, z_covariance : (4,) real and imaginary part of Z_v, then of Z_u, and their covariance (4, 4)
+    turn, turn_covariance : (2,) turn by u and by v, and their covariance (2, 2)
+    residuals : (2 w,) residuals of the displacements, as shares of their length
+    """
 
     z: Floats
     z_covariance: Floats
@@ -126,20 +140,20 @@ class _Shown(NamedTuple):
 def decide_conventions(
     windows: DriveWindows, *, metric: bool, gyro_sense: int = 0, mirror_allowed: bool = True
 ) -> Decision:
-    """Return the most likely of all hypotheses.
+    """Return the most likely of all hypotheses; the names in the log if there are too few windows.
 
     Parameters
     ----------
-    metric : whether positions may be mirrored (a pose in a local frame); geodetic positions may not
-    gyro_sense : +1 where a gyro turns as the heading is named, -1 where in the opposite sense, 0 without one
-    mirror_allowed : whether the heading's handedness is free
+    metric : whether positions may be mirrored, as poses in a local frame may; geodetic positions may not
+    gyro_sense : result of `gyro_sense`
+    mirror_allowed : whether the heading may be mirrored
     """
     if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return Decision(AS_NAMED, None)
     track = windows.track
     laid = windows.laid, windows.over(track.at_places(track.half_difference * track.nose))
     fits = {1: _show(windows, laid, 1), -1: _show(windows, (np.conj(laid[0]), np.conj(laid[1])), -1)}
-    # twice the negative log-likelihood of each handedness, both with the noise of the better one
+    # Twice the negative log-likelihood of each handedness is computed with the noise of the better one.
     scale = min(mad_std(convention.residuals, 0.0) for convention in fits.values())
     scale = max(scale, 0.5 * track.place_std_m / windows.length_m[0])
     losses = {hand: soft_l1_loss(convention.residuals / scale) / STARTS_A_WINDOW for hand, convention in fits.items()}
@@ -168,9 +182,11 @@ class NamedFit(NamedTuple):
 
     Attributes
     ----------
-    residuals : (k,) of the displacements, as a share of their length; scatter : their robust scatter
-    offset_rad : of the heading
-    turn_sigmas : turn of the heading by the wheels, clockwise for a faster left side, in standard deviations
+    residuals : (k,) residuals of the displacements, as shares of their length
+    scatter : robust scatter of the residuals
+    offset_rad : offset of the heading [rad]
+    turn_sigmas : ratio of the heading's turn to the wheels' turn, in standard deviations; positive if the heading turns
+        clockwise with a faster left side
     """
 
     residuals: Floats
@@ -184,7 +200,7 @@ class NamedFit(NamedTuple):
 
     @classmethod
     def of(cls, windows: DriveWindows) -> NamedFit:
-        """Return the fit to the windows of a log."""
+        """Return the agreement in the windows of a log."""
         track = windows.track
         laid = windows.laid, windows.over(track.at_places(track.half_difference * track.nose))
         fit = _show(windows, laid, 1)
@@ -194,9 +210,9 @@ class NamedFit(NamedTuple):
 
 
 def senses_by_distance(track: Track) -> Convention:
-    """Return the convention that distances alone show, for a drive without a heading: which side counts backwards.
+    """Return the convention of a drive without a heading, by distances alone: whether one side counts backwards.
 
-    Either side may be reversed; the convention with which the robot drives forward is chosen.
+    Distances do not show which side it is; the side with which the robot then drives forward is chosen.
     """
     _, step, left, right = cut_chords(track)
     chord = np.abs(step)
@@ -213,7 +229,7 @@ def senses_by_distance(track: Track) -> Convention:
 
 
 TIE = 9.0
-"""Difference in cost from the best hypothesis below which another one is equally likely."""
+"""Difference of the cost from the cost of the best hypothesis below which a hypothesis counts as equally likely."""
 
 
 def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -> _Shown:
@@ -268,15 +284,20 @@ def _cost(convention: Convention, fit: _Shown) -> tuple[float, float]:
 def convention_notes(decision: Decision, *, corrects: bool, mirrored: bool = False) -> list[Note]:
     """Return findings about sides and senses that differ from their names, except the sense of the heading.
 
-    `mirrored`: the log has no gyro and no heading, so that swapped sides and mirrored positions look alike.
+    Parameters
+    ----------
+    corrects : whether the preset corrects them
+    mirrored : whether the log has neither gyro nor heading, so that swapped sides and mirrored positions look alike
     """
     convention, alternative, done = decision.convention, decision.as_likely, ": corrected" if corrects else ""
     notes = []
     if convention.swapped:
-        alike = (
-            "; or the sign of a latitude or longitude is wrong, or both are exchanged: no gyro or heading shows which"
+        other_cause = (
+            "; or a latitude or longitude has the wrong sign, or both are exchanged: "
+            "without gyro and heading, the log cannot tell these causes apart"
         )
-        notes.append(note("sides_swapped", f"left and right wheels are swapped{done}{alike if mirrored else ''}"))
+        text = f"left and right wheels are swapped{done}{other_cause if mirrored else ''}"
+        notes.append(note("sides_swapped", text))
     signs = (convention.sign_left, convention.sign_right)
     reversed_ = {(-1, 1): "the left wheels", (1, -1): "the right wheels", (-1, -1): "both wheels"}
     if signs in reversed_:
@@ -293,13 +314,13 @@ def convention_notes(decision: Decision, *, corrects: bool, mirrored: bool = Fal
         }
         words = " with ".join(part for part, is_so in parts.items() if is_so)
         words = words or "sides as named and a heading turned by 180°"
-        why = f"{words} would explain the log as well: check the wheels' names"
+        why = f"{words} would explain the log as well: check the names of the wheels"
         notes.append(note("sides_ambiguous", why))
     return notes
 
 
 def gyro_sense(log: RobotLog, track: Track) -> int:
-    """Return +1 where the gyro turns as the heading is named, -1 where in the opposite sense, 0 where not shown."""
+    """Return +1 if the gyro turns in the sense of the heading as named, -1 in the opposite sense, 0 if not shown."""
     if log.gyro is None or len(track.heading_t) < 2:
         return 0
     t, rate = (log.gyro.stamp_ns - log.wheels.stamp_ns[0]) / 1e9, log.gyro.rate_radps
@@ -308,7 +329,7 @@ def gyro_sense(log: RobotLog, track: Track) -> int:
 
 
 def apply_convention(log: RobotLog, convention: Convention) -> RobotLog:
-    """Return the log with the sides, heading and position of a convention; the same log if all names are right."""
+    """Return the log with sides, headings and positions corrected by a convention; the same log for `AS_NAMED`."""
     if convention == AS_NAMED:
         return log
     wheels, heading, gnss = log.wheels, log.heading, log.gnss

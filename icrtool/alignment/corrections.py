@@ -1,4 +1,4 @@
-"""Align the streams of a log: conventions, wheel scale, heading offset, delays, from one estimate.
+"""Correction of the streams of a log: conventions, wheel scale, heading offset and delays, from one estimate.
 
 Errors that are significant and large enough to have an effect are corrected and reported with their standard
 deviations. Other findings are only reported. Preset ``paper`` corrects nothing.
@@ -54,6 +54,8 @@ from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
 CORRECTION_SIGMAS = 2.5
+"""Smallest size of a delay that is corrected, in its standard deviations."""
+
 SMALLEST_LEAD_S, LARGEST_STD_S = 0.2, 0.1
 """Smallest lead that is corrected, and largest standard deviation of a corrected delay [s].
 
@@ -62,7 +64,7 @@ delay includes it. A small lead more often comes from such a response than from 
 
 
 class Delay(NamedTuple):
-    """A delay against the wheels and its standard deviation [s], NaN where the drive does not show it."""
+    """A delay with respect to the wheels and its standard deviation [s]; NaN where the drive does not show it."""
 
     value_s: float
     std_s: float
@@ -77,12 +79,13 @@ UNKNOWN = Delay(math.nan, math.nan)
 
 
 class StreamDelays(NamedTuple):
-    """Delays that were found, and delays that are corrected because they are clear or configured.
+    """Delays that were measured, and delays that are corrected because they are significant or configured.
 
     Attributes
     ----------
-    heading, gnss : as measured; apart : delay of the position against the heading
-    together : position and heading are fields of the same messages
+    heading, gnss : measured delays of headings and positions with respect to the wheels
+    apart : measured delay of the positions with respect to the headings
+    together : whether position and heading are fields of the same messages
     applied_heading_s, applied_gnss_s : delays that are corrected [s]
     """
 
@@ -113,7 +116,7 @@ class StreamDelays(NamedTuple):
 
 
 def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tuple[StreamDelays, list[Note]]:
-    """Return the delays of heading and positions against the wheels, with corrected delays, and the findings."""
+    """Return the measured and the corrected delays of headings and positions, and findings about corrections."""
     heading = position = apart = UNKNOWN
     if fit is not None:
         found = (Delay(*fit.estimate(name)) for name in ("heading_delay", "position_delay"))
@@ -160,10 +163,19 @@ def _is_large(delay_s: float) -> bool:
 
 
 def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bool], *, together: bool) -> list[Note]:
-    """Return a finding for each stream, heading or position, that was moved without being configured."""
+    """Return a finding for each stream that is moved by a delay that was not configured.
+
+    Parameters
+    ----------
+    applied, std_s, free : corrected delay [s], its standard deviation [s], and whether it is not configured, first of
+        the heading, then of the position
+    together : as in `StreamDelays`
+    """
     subjects = [("the heading", "lags", "frames.heading_delay_s"), ("the position", "lags", "frames.reference_delay_s")]
     alike = not together and applied[0] == applied[1] and free[0]
-    also = "; the position is corrected alike, as nothing shows that its delay differs" if alike else ""
+    also = (
+        "; the position is corrected by the same delay, because no difference of both delays is shown" if alike else ""
+    )
     if together:
         subjects[1] = ("the position and its heading", "lag", "frames.reference_delay_s")
     notes = list[Note]()
@@ -177,16 +189,18 @@ def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bo
 
 
 class AlignedStreams(NamedTuple):
-    """A log whose streams fit together, and the corrections that were made.
+    """A log with corrected streams, and the corrections.
 
     Attributes
     ----------
-    log : with all corrections but the heading's offset. This offset is in `heading`, and the filter applies it
-    wheels, heading : facts about them
-    scales : factors of the left and of the right speeds, in addition to the configured scales
-    correlation_s : correlation time of the noise of a stated heading, where the noise was raised
-    track : data of the estimate; fit : the estimate, None where the drive is too short
-    derived : the heading where it was estimated, else None
+    log : log with all corrections but the offset of the heading, which is in `heading`
+    wheels, heading : facts about wheels and heading
+    scales : factors on the speeds of the left and of the right side, in addition to the configured scales
+    correlation_s : correlation time of the noise of a stated heading whose noise was raised [s]; else 0
+    delays : delays of headings and positions
+    track : data of the estimate
+    fit : the estimate; None where the drive is too short
+    derived : the estimated heading; None for a stated heading
     notes : the findings
     """
 
@@ -202,9 +216,9 @@ class AlignedStreams(NamedTuple):
     notes: tuple[Note, ...]
 
     def steps(self) -> tuple[FixSteps, FixSteps]:
-        """Return steps of position and of heading [rad] between the fixes, minus the motion of the wheels.
+        """Return the steps of position [m] and of heading [rad] between the fixes, minus the motion of the wheels.
 
-        Without an estimate there are no steps of the heading.
+        Without an estimate, the second result is empty.
         """
         track = self.track
         if self.fit is None:
@@ -303,7 +317,7 @@ def _name_streams(
     named = apply_convention(log, decision.convention)
     if named is not log:
         if derived is not None:
-            # the heading was estimated with wheels whose sides were exchanged or reversed
+            # The heading was estimated with exchanged or reversed sides, and is estimated again.
             derived = derive_heading(named, width_m)
             named = derived.apply(named)
         windows = _windows(named, width_m, derived)

@@ -51,8 +51,8 @@ ESTIMATE_NAMES = (
 
 ESTIMATE_PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 ESTIMATE_PRIOR_STD = np.array([0.5, 0.1, 0.5, 0.2, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5, 0.1])
-"""Prior standard deviations, in the order of `ESTIMATE_NAMES`. They decide where a drive does not separate parameters,
-and have little effect otherwise.
+"""Prior standard deviations, in the order of `ESTIMATE_NAMES`. They have an effect only where a drive does not separate
+parameters.
 
 Robots are symmetric: the middle of the ICRs is near 0 (`MIDDLE_STD_M`), and x_icr is within half of b (the third value
 is in units of b). Delays of position and heading of one robot usually agree to 0.15 s. An absolute heading drifts by at
@@ -72,8 +72,8 @@ SMOOTH_S = 0.2
 """Half the time over which the heading is averaged for the sideways motion [s]. Its noise would reduce this motion."""
 
 OVERLAP = 1.0
-"""Number of residuals that count as one independent residual. Each residual counts, because the windows end at
-different fixes; errors that windows have in common show in the spread between groups of windows."""
+"""Number of residuals that count as one independent residual. It is 1, because the windows end at different fixes; the
+spread between groups of windows shows errors that windows have in common."""
 
 RESPONSE_STD_S = RESPONSE_S / math.sqrt(12.0)
 """Standard deviation of a robot's response to its wheels [s]. No drive separates it from a delay of the streams."""
@@ -118,12 +118,15 @@ FIVE_TERMS = MODELS[FIVE]
 
 
 class ResidualsByEstimate(NamedTuple):
-    """Residuals of the windows with nothing corrected but W (before), and with every estimate (after).
+    """Residuals of the windows, prediction minus measurement, before and after the estimates.
+
+    The residuals before use the turn gain alone; the residuals after use all estimates.
 
     Attributes
     ----------
-    before, after : (2, w) along and across the heading [m], prediction minus measurement
-    turn_before, turn_after : (u,) of the heading changes [rad]; turn_rad : (u,) as measured
+    before, after : (2, w) residuals of displacements along and across the heading [m]
+    turn_before, turn_after : (u,) residuals of the heading changes [rad]
+    turn_rad : (u,) measured heading changes [rad]
     """
 
     before: Floats
@@ -134,14 +137,16 @@ class ResidualsByEstimate(NamedTuple):
 
 
 class AlignmentFit(NamedTuple):
-    """The parameters in the order of `ESTIMATE_NAMES`.
+    """The estimate of the alignment, with k parameters in the order of `ESTIMATE_NAMES`.
 
     Attributes
     ----------
-    fit : the robust fit; covariance : of its parameters
-    width_m : track width b, with which w was formed
-    windows : data of the fit; model : the expected motion in them
-    turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is stated at this speed
+    fit : the robust fit
+    covariance : (k, k) covariance of the parameters
+    width_m : track width b of the equations [m]
+    windows : data of the fit
+    model : expected motion in the windows
+    turning_speed_mps : mean speed, weighted by the square of the turn rate [m/s]; x_icr is stated at this speed
     """
 
     fit: RobustFit
@@ -152,13 +157,16 @@ class AlignmentFit(NamedTuple):
     turning_speed_mps: float
 
     def estimate(self, name: str) -> tuple[float, float]:
-        """Return a parameter and its standard deviation; ``position_delay`` is the delay against the wheels."""
+        """Return a parameter and its standard deviation, by its name in `ESTIMATE_NAMES`.
+
+        ``position_delay`` is the delay of the positions with respect to the wheels [s].
+        """
         if name == "position_delay":
             both = self.covariance[np.ix_([POSITION_LAG, HEADING_LAG], [POSITION_LAG, HEADING_LAG])]
             return float(self.fit.x[POSITION_LAG] + self.fit.x[HEADING_LAG]), math.sqrt(max(float(both.sum()), 0.0))
         row = ESTIMATE_NAMES.index(name)
         variance = float(self.covariance[row, row])
-        # rounding may leave a variance below zero where the drive hardly shows the parameter
+        # Rounding may leave a variance below zero if the drive hardly shows the parameter.
         return float(self.fit.x[row]), math.sqrt(variance) if variance > 0.0 else math.inf
 
     @property
@@ -201,7 +209,7 @@ class AlignmentFit(NamedTuple):
     def geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs about the antenna, multiplier and side scales, and their covariance (6, 6)."""
         x, b, speed = self.fit.x, self.width_m, self.turning_speed_mps
-        # at this speed, sideways slip l v w has the same effect as c
+        # At one speed, the sideways slip l v has the same effect as c.
         aside = x[SIDEWAYS] + x[SIDE_SLIP] * speed
         by = np.zeros((len(FIVE_TERMS.terms), len(x)))
         by[[0, 1, 2, 3], [WHEEL_SCALE, ICR_MIDDLE, TURN_GAIN, SIDE_ASYMMETRY]] = 1.0
@@ -209,7 +217,7 @@ class AlignmentFit(NamedTuple):
         sideways = x[TURN_GAIN] * aside * 2.0 / b
         parameters = np.append(x[[WHEEL_SCALE, ICR_MIDDLE, TURN_GAIN, SIDE_ASYMMETRY]], sideways)
         values, covariance = FittedModel(FIVE_TERMS, parameters, by @ self.covariance @ by.T).geometry(b)
-        # at one speed, positions that lag have the same effect as an antenna further back
+        # At one speed, positions that lag have the same effect as an antenna that is further back.
         covariance[2, 2] += (speed * _clock_std_s(self.windows.track, b)) ** 2
         return values, covariance
 
@@ -253,7 +261,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
         return None
     track, model = windows.track, MotionOfWindows(windows, width_m)
     start = ESTIMATE_PRIOR_MEAN.copy()
-    # direction of the displacements relative to the wheels' motion along the heading
+    # The heading offset begins at the direction of the displacements relative to the wheels' motion along the heading.
     unit = (windows.seen * np.conj(windows.laid))[np.abs(windows.laid) > windows.length_m / 3]
     spins = len(unit) < FEWEST_OVERLAPPING
     if not spins:
@@ -262,7 +270,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     kind = np.concatenate([np.zeros(distances, np.int64), np.ones(distances, np.int64), np.full(turns, 2)])
     group = np.concatenate([windows.group, windows.group, windows.turn_group])
     prior_std = ESTIMATE_PRIOR_STD.copy()
-    # spins show the distance of the ICRs' middle from the antenna, but not its direction
+    # Spins on the spot show the distance of the middle of the ICRs from the antenna, but not its direction.
     prior_std[HEADING_OFFSET] = MOUNTING_STD_RAD if spins else prior_std[HEADING_OFFSET]
     prior_std[POSITION_LAG] = SAME_CLOCK_STD_S if track.same_clock else prior_std[POSITION_LAG]
     prior_std[ICR_MIDDLE] = MIDDLE_STD_M / (1.5 * width_m)
@@ -295,7 +303,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
 
 
 class MotionOfWindows:
-    """Motion for given parameters: residuals of the windows with their Jacobian, place and turn until each fix."""
+    """Motion in windows for given parameters: residuals with their Jacobian, and place and turn until each fix."""
 
     def __init__(self, windows: DriveWindows, width_m: float) -> None:
         self.track, self.windows, self.b = windows.track, windows, width_m
@@ -305,7 +313,7 @@ class MotionOfWindows:
         self.edge_t = track.place_t[np.stack([windows.begin, windows.end])]
         self.level = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
         self.turn_v, self.turn_w = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
-        # mean of the heading over `SMOOTH_S` to either side, so that noise is not taken for a turn
+        # The heading is averaged over `SMOOTH_S` on both sides, so that its noise does not count as a turn.
         t, area = track.heading_t, trapezoids(track.heading_t, track.heading)
         reach = np.minimum(np.minimum(t - t[0], t[-1] - t), SMOOTH_S)
         mean = (np.interp(t + reach, t, area) - np.interp(t - reach, t, area)) / np.maximum(2.0 * reach, 1e-9)
@@ -334,7 +342,7 @@ class MotionOfWindows:
         path = track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
         before, after = (np.interp(t + shift_s, track.t, path) for shift_s in (-DELAY_STEP_S, DELAY_STEP_S))
         by[POSITION_LAG] = np.diff(before - after, axis=0) / (2 * DELAY_STEP_S)
-        # the derivative of the heading's unit vector, over `HEADING_STEP_S`
+        # The derivative of the unit vector of the heading is taken over `HEADING_STEP_S`.
         after, before = (
             track.heading_at(t + shift_s + x[HEADING_LAG]) + x[HEADING_OFFSET]
             for shift_s in (HEADING_STEP_S, -HEADING_STEP_S)

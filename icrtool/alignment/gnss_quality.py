@@ -1,4 +1,4 @@
-"""Classes of the fixes (fixed, float, other) from their messages and their motion, and the noise of each class.
+"""Classification of fixes (fixed, float, other) by their messages and their motion, and the noise of each class.
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
 tens of seconds. If they were treated as independent, the filter would follow them. Some drivers still state a
@@ -50,6 +50,7 @@ CORRELATION_S = 10.0
 """Correlation time of the errors of such fixes [s]."""
 
 SHORTEST_LOSS_S = 2.0
+"""Shortest span without a fixed solution that counts as a loss of RTK [s]."""
 
 
 class GnssQuality(NamedTuple):
@@ -57,9 +58,10 @@ class GnssQuality(NamedTuple):
 
     Attributes
     ----------
-    fixes : with their classes and the variances to use
-    statistics : of the classes
-    losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
+    fixes : fixes with their classes and the variances to use
+    statistics : noise of each class
+    losses_ns : (k, 2) half-open spans without RTK [ns], in a log where fixed is the norm
+    notes : findings about fixes that are not fixed, and about noise
     """
 
     fixes: Fixes
@@ -78,6 +80,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
 
     Parameters
     ----------
+    steps : steps between the fixes minus the motion of the wheels
     measured_m : as in `icrtool.alignment.sensor_noise.fixes_of`
     """
     gnss, changes = log.gnss, config.filter.rules.measures_noise
@@ -147,7 +150,7 @@ def _losses(stamps: Ints, fixed: Bools) -> Ints:
     edge = np.concatenate([[-1], rows, [len(stamps)]])
     times = stamps[np.clip(edge, 0, len(stamps) - 1)]
     lost = (np.diff(edge) > 1) & (np.diff(times) > SHORTEST_LOSS_S * 1e9)
-    # the last span includes the last fix
+    # A span that reaches to the end of the log includes the last fix.
     ends = times[1:] + (edge[1:] == len(stamps))
     return np.column_stack([times[:-1][lost], ends[lost]])
 
@@ -157,7 +160,9 @@ def _notes(fixes: Fixes, stated: Floats, used_std: Floats, raised: dict[str, flo
 
     Parameters
     ----------
-    stated, used_std : (m,) deviations before and after [m]; raised : [m] by class
+    stated, used_std : (m,) stated standard deviation of each fix, and the one that is used [m]
+    raised : raised standard deviation of each class [m]
+    changes : whether the preset changes the noise
     """
 
     def accuracy(rows: Bools, silent: str) -> str:
@@ -175,7 +180,7 @@ def _notes(fixes: Fixes, stated: Floats, used_std: Floats, raised: dict[str, flo
         notes.append(note("gnss_float_as_fixed", f"{text}{': taken as float' if changes else ''}"))
     if down.any():
         used = f"they are used with ±{np.median(used_std[down]):.2g} m"
-        notes.append(note("gnss_not_fixed", f"{down_count} are not RTK fixed, as most of this log are: {used}"))
+        notes.append(note("gnss_not_fixed", f"{down_count} are not RTK fixed, unlike most fixes of this log: {used}"))
     for code, name in CLASSES.items():
         rows = fixes.fix_class == code
         if name in raised and not fixes.down_weighted[rows].all():
@@ -208,14 +213,16 @@ error."""
 
 
 def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
-    """Return the fixes (m,) among the `claimed` ones that move like RTK float.
+    """Return a mask of the fixes (m,) that are reported as fixed and move like RTK float.
+
+    A jump alone does not show which of its sides is wrong; noise, or a second jump back, shows it. Otherwise the class
+    is not changed.
 
     Parameters
     ----------
-    claimed : bool (m,), reported as fixed; flagged : bool (m,), by a flag of the message itself and not by its variance
-
-    A jump alone does not show which of its sides is wrong. Noise or a second jump back shows it. Otherwise the class is
-    unchanged.
+    stamps : (m,) stamps of the fixes [ns]
+    claimed : (m,) mask of the fixes that are reported as fixed
+    flagged : (m,) mask of the fixes that are reported as fixed by a flag, not only by their variance
     """
     misreported = np.zeros(len(claimed), np.bool_)
     level, moves = steps.stretches(claimed)
@@ -245,7 +252,7 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
 
 
 def _moving_mean(level: Floats, width: int) -> Floats:
-    """Return the mean of `level` (n,) over a window of `width` about each entry, NaN where it holds no number."""
+    """Return the mean of the finite numbers in a window of `width` about each entry (n,); NaN without such numbers."""
     kernel, is_known = np.ones(width), np.isfinite(level)
     total = np.convolve(np.where(is_known, level, 0.0), kernel, "same")[: len(level)]
     count = np.convolve(is_known.astype(np.float64), kernel, "same")[: len(level)]
@@ -255,13 +262,14 @@ def _moving_mean(level: Floats, width: int) -> Floats:
 
 
 def _noisy_side(averaged: Floats, nearby: Floats, moves: Bools, at: int) -> slice:
-    """Return the float stretches before or after a jump in stretch `at`; none where noise does not show the side."""
+    """Return the float stretches before or after a jump in stretch `at`; empty where noise does not show the side."""
     before, after = at - 1 - STRETCHES_PER_SIDE // 2, at + 1 + STRETCHES_PER_SIDE // 2
     if before < 0 or after >= len(averaged) or not np.isfinite(averaged[[before, after]]).all():
         return slice(0, 0)
     half = STRETCHES_PER_SIDE // 2
     if moves[before - half : before + half + 1].any() != moves[after - half : after + half + 1].any():
-        return slice(0, 0)  # while the robot parks, fixes of all classes have less noise
+        # While the robot is parked, fixes of all classes have less noise, so that the sides cannot be compared.
+        return slice(0, 0)
     left, right = max(float(averaged[before]), USUAL_M2), max(float(averaged[after]), USUAL_M2)
     if max(left, right) < SIDES_VARIANCE * min(left, right):
         return slice(0, 0)

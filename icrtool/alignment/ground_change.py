@@ -37,11 +37,11 @@ they overlap."""
 
 
 class GroundChanges(NamedTuple):
-    """The most likely changes.
+    """The most likely changes of ground of a drive.
 
     Attributes
     ----------
-    stretches : of one ground each, two or more, in order of time
+    stretches : two or more stretches of the drive in order of time, each on one ground
     """
 
     stretches: tuple[GroundStretch, ...]
@@ -57,14 +57,14 @@ class GroundChanges(NamedTuple):
         values = _joined(
             [f"{stretch.multiplier:.3f} ± {max(stretch.multiplier_std, 0.001):.3f}" for stretch in self.stretches]
         )
-        when = _joined([f"{t:.0f} s" for t in self.times_s])
+        times = _joined([f"{t:.0f} s" for t in self.times_s])
         options = " ".join(f"--terrain-change {t:.0f}" for t in self.times_s)
-        where, fits, states = ("before and after", "neither", "states it")
+        where, fitted_stretches, states = ("before and after", "neither", "states it")
         if len(self.times_s) > 1:
-            where, fits, states = ("in the stretches", "none", "state them")
+            where, fitted_stretches, states = ("in the stretches", "none", "state them")
         return (
-            f"the ground changes at about {when}: multiplier {values} {where}; one number "
-            f"fits {fits}: {options} {states} to the filter, --from and --to fit each stretch"
+            f"the ground changes at about {times}: multiplier {values} {where}; one number "
+            f"fits {fitted_stretches}: {options} {states} to the filter, --from and --to fit each stretch"
         )
 
 
@@ -74,7 +74,15 @@ def _joined(texts: list[str]) -> str:
 
 
 class _Turns(NamedTuple):
-    """Windows (n,): `begin` [s], turn `x` of the wheels and `y` of the heading [rad], number of their group of time."""
+    """Turns of wheels and heading in windows of time.
+
+    Attributes
+    ----------
+    begin : (n,) begin of each window [s]
+    x : (n,) turn of the wheels [rad]
+    y : (n,) turn of the heading [rad]
+    group : (n,) number of the span of `CHANGE_GROUP_S` in which the window begins
+    """
 
     begin: Floats
     x: Floats
@@ -82,7 +90,7 @@ class _Turns(NamedTuple):
     group: Ints
 
     def rows(self, first: int, stop: int) -> _Turns:
-        """Return some of the windows."""
+        """Return the windows from row `first` to the row before `stop`."""
         return _Turns._make(column[first:stop] for column in self)
 
 
@@ -164,8 +172,8 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
         if not math.isfinite(best[-1]):
             break
         at, rows = count - 1, [count - 1]
-        for of_row in reversed(best_before):
-            at = int(of_row[at])
+        for best_first in reversed(best_before):
+            at = int(best_first[at])
             rows.append(at)
         ways.append([0, *(int(places[row]) for row in reversed(rows))])
         costs.append(float(best[-1]))
@@ -189,7 +197,7 @@ def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
 
 
 def _stretches(turns: _Turns, rows: list[int]) -> tuple[GroundStretch, ...] | None:
-    """Return the stretches between rows, None where a multiplier is not shown, or equals the next."""
+    """Return the stretches between rows; None where a stretch shows no multiplier, or two neighbours show the same."""
     stretches, ratios = list[GroundStretch](), list[tuple[float, float]]()
     for first, stop in pairwise(rows):
         part = turns.rows(first, stop)

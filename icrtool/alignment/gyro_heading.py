@@ -35,18 +35,39 @@ from icrtool.kernels.robust import long_run_factor
 from icrtool.kernels.track import Track
 
 ANGLE, BIAS, SCALE, X, DELAY = range(5)
+"""Rows of the states of turn rate and courses: heading [rad], bias of the rate [rad/s], scale error of the rate, x of
+the ICRs ahead of the antenna [m], delay of the positions [s]."""
+
 OFFSET, WANDER, LAG = 5, 6, 7
-"""Rows of the states of the first absolute heading. The states of the next one follow."""
+"""Rows of the states of the first absolute heading: offset [rad], slowly varying error [rad], delay [s]. The states of
+the next absolute heading follow."""
+
 GYRO_STATES, STATES_OF_A_SOURCE = 5, 3
+"""Number of states of turn rate and courses, and number of states of an absolute heading."""
+
 COURSE, STANDSTILL, NOTHING, ABSOLUTE = range(4)
+"""Kinds of events: a course over ground, a rate of the standing robot, no measurement, a sample of the first absolute
+heading. The next absolute headings have the next numbers."""
 
 SETTLED_SIGMAS = 3.0
+"""Largest innovation, in standard deviations, that counts when the correlation of the courses' errors is measured.
+Larger innovations are reduced to this size."""
+
 LARGEST_RATE_HZ = 20.0
+"""Largest rate of the estimated headings [Hz]."""
 
 STANDING_S = 0.6
+"""Duration of the spans in which a standing robot is looked for [s]."""
+
 STANDING_RATE_STD = math.radians(0.05)
+"""Standard deviation of the mean rate of a standing robot in such a span [rad/s]."""
+
 GYRO_STATE_PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1])
+"""Standard deviations of the states of turn rate and courses before the log, in the units of these states."""
+
 ABSOLUTE_PRIOR_STD = np.array([math.pi, math.radians(1.0), 0.05])
+"""Standard deviations of the states of an absolute heading before the log, in the units of these states."""
+
 ANY_DIRECTION_STD = math.pi / math.sqrt(3.0)
 """Standard deviation of a direction of which nothing is known [rad], as before the robot drives: uniform on the
 circle."""
@@ -55,6 +76,8 @@ LONGEST_GYRO_STEP_S = 1.0
 """Longest step between events [s]. A longer gap is cut into steps, so that the uncertainty grows within it."""
 
 LEAST_COURSE_STD_RAD = math.radians(0.05)
+"""Smallest standard deviation of a course over ground [rad]."""
+
 ROUNDS, LONG_DELAY_S, LARGE_BIAS_RAD = 3, 0.15, math.radians(1.0)
 """Largest number of linearisations, changes of the delay of the fixes [s] and of a window's turn by the bias [rad] from
 which on the courses are linearised again."""
@@ -95,10 +118,14 @@ class AbsoluteHeading(NamedTuple):
 
     Attributes
     ----------
-    t : (m,) [s]; heading : (m,) [rad]; std : (m,) of their white noise [rad]
+    t : (m,) stamps [s]
+    heading : (m,) clockwise from north [rad], each with the same offset
+    std : (m,) standard deviation of the white noise [rad]
     rate : (m,) turn rate, which a delay of the heading multiplies [rad/s]
-    offset_std : prior of the offset, about zero [rad]; aligned_std : its prior where no offset is significant
-    topic : where it was read; part : words for the user
+    offset_std : standard deviation of the offset before the log [rad], about zero
+    aligned_std : standard deviation of the offset [rad] where the offset is not significant
+    topic : topic of the sensor
+    part : name of the sensor for the user
     """
 
     t: Floats
@@ -113,15 +140,17 @@ class AbsoluteHeading(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HeadingEstimate:
-    """Headings at times t (n,) [s].
+    """Headings that were estimated, with their standard deviations.
 
     Attributes
     ----------
-    causal, causal_std : (n,) from the past alone, constants excepted; smoothed, smoothed_std : (n,) from all
-    constants, constants_std : (k,) heading and bias at the end, scale error, x [m], delay [s]; then offset, wandering
-        error at the end, delay of each absolute heading
-    noises : chosen by the likelihood; names of an absolute heading's noises begin with its number
-    seen_t : times of the courses over ground (c,) [s]
+    t : (n,) stamps [s]
+    causal, causal_std : (n,) headings from the past alone, constants excepted, and their standard deviations [rad]
+    smoothed, smoothed_std : (n,) headings from the whole log, and their standard deviations [rad]
+    constants, constants_std : (k,) heading [rad] and bias [rad/s] at the end, scale error, x [m], delay [s]; then for
+        each absolute heading its offset [rad], its slowly varying error at the end [rad] and its delay [s]
+    noises : noises by name, chosen by the likelihood; names of an absolute heading's noises begin with its number
+    seen_t : (c,) times of the courses over ground [s]
     """
 
     t: Floats
@@ -176,13 +205,13 @@ def estimate_heading(
             return None
         problem = _Problem(courses, still, turn, ())
         if attempt:
-            # the noises of turn rate and courses are chosen without the absolute headings
+            # The noises of turn rate and courses are chosen without the absolute headings.
             noises = problem.choose(GYRO_NOISES, noises)
         better = problem.guess(noises)._replace(middle=guess.middle)
         turned = float(np.abs(better.bias - guess.bias).max() * np.median(courses.end - courses.begin))
         settled = turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S and has_middle
         if turned < LARGE_BIAS_RAD:
-            # with a wrong bias the lengths of the courses show the bias, because it bends the path
+            # With a wrong bias, the lengths of the courses show the bias, because it bends the path.
             better, has_middle = better._replace(middle=fit_middle(courses, guess)), True
         guess = guess if settled else better
         if settled or attempt == ROUNDS:
@@ -263,7 +292,12 @@ class _Problem:
         self.stated = HeadingEvents(elapsed, turned, holes, z[order], h, variance, angle=h[:, ANGLE] > 0.0)
 
     def events(self, noises: dict[str, float], alike: float = 1.0, count: int | None = None) -> HeadingEvents:
-        """Return the events, or the first `count` of them, with the variances of some noises."""
+        """Return the events, or the first `count` of them, with the variances of some noises.
+
+        Parameters
+        ----------
+        alike : number of courses over ground that count as one, because their errors are correlated
+        """
         stated, kind = self.stated.cut(count), self.kind[:count]
         of_course = noises["fixes"] ** 2 * stated.r + (noises["slip"] * stated.h[:, X]) ** 2 + LEAST_COURSE_STD_RAD**2
         white = np.ones(ABSOLUTE + len(self.absolute))
@@ -317,7 +351,7 @@ class _Problem:
         return noises
 
     def _forward(self, noises: dict[str, float]) -> tuple[HeadingEvents, HeadingModel, HeadingPasses]:
-        """Run the filter for given noises; courses with a common error have less weight."""
+        """Return events, model and passes of the filter for given noises; courses with a common error weigh less."""
         events, model = self.events(noises), self.model(noises)
         passes = filter_headings(events, model)
         # Slip that the model lacks correlates the errors of successive courses over ground.
@@ -339,7 +373,7 @@ class _Problem:
         """Return the estimate for given noises."""
         events, model, passes = self._forward(noises)
         states, covariances = smooth_headings(events, model, passes)
-        del passes  # frees memory for the pass below
+        del passes  # This frees memory for the pass below.
         fixed = np.ones(len(model.x), np.bool_)
         fixed[[ANGLE, BIAS]] = False
         fixed[GYRO_STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
@@ -349,7 +383,7 @@ class _Problem:
         del covariances
         passes = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
         causal, of_causal = passes.x, passes.P
-        del passes, events  # frees memory for the arrays at each sample
+        del passes, events  # This frees memory for the arrays at each sample.
         t, turn, turned_by_rate = self.t, self.turn, self.G
         # The heading at samples of the rate: causal from the last event on, smoothed between events.
         interval_s = float(np.median(np.diff(turn.t), overwrite_input=True))

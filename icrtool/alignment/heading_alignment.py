@@ -26,13 +26,18 @@ LIKE_RAD = math.radians(1.0)
 offset with a larger standard deviation gets no cause."""
 
 SMALLEST_NAME_RAD = math.radians(0.5)
+"""Smallest declination or convergence that is stated as a cause [rad]."""
+
 UTM_LATITUDES_DEG = (-80.0, 84.0)
+"""Smallest and largest latitude of the UTM grid [deg]."""
+
 TURN_WORDS = {
     0.0: "",
     90.0: "a quarter turn clockwise",
     -90.0: "a quarter turn counter-clockwise",
     180.0: "half a turn",
 }
+"""Mountings of a sensor that are a cause of an offset: the offset [deg], and its words."""
 
 
 class OffsetName(NamedTuple):
@@ -40,9 +45,10 @@ class OffsetName(NamedTuple):
 
     Attributes
     ----------
-    text : for the user, empty where nothing fits
-    declination_deg : magnetic declination (east positive) at the log's place and date, None where not known
-    convergence_deg : UTM grid convergence there, grid north east of true north positive; None where not known
+    text : the cause in words for the user; empty where no cause fits
+    declination_deg : magnetic declination at the log's place and date, east positive [deg]; None where not known
+    convergence_deg : UTM grid convergence at the log's place [deg], positive where grid north is east of true north;
+        None where not known
     """
 
     text: str
@@ -51,6 +57,7 @@ class OffsetName(NamedTuple):
 
 
 NO_NAME = OffsetName("", None, None)
+"""The name of an offset without a possible cause."""
 
 
 def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_ns: int) -> OffsetName:
@@ -58,24 +65,25 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
 
     Parameters
     ----------
-    offset_rad : heading minus course over ground; a heading from magnetic north is less by the declination
-    datum : where; None: a metric reference without a known north
-    stamp_ns : when, Unix time
+    offset_rad : heading minus course over ground [rad]; a heading from magnetic north is less by the declination
+    sigma_rad : standard deviation of the offset [rad]
+    datum : place of the log; None: a metric reference without a known north
+    stamp_ns : time of the log, Unix time [ns]
     """
     if not sigma_rad <= LIKE_RAD:
         return NO_NAME
     declination = _declination_deg(datum, stamp_ns) if datum is not None else None
     convergence = utm_convergence_deg(datum) if datum is not None else None
     norths, causes = [("", 0.0)], []
-    for what, angle_deg in (("magnetic declination", declination), ("UTM grid convergence", convergence)):
+    for name, angle_deg in (("magnetic declination", declination), ("UTM grid convergence", convergence)):
         if angle_deg is not None and abs(angle_deg) > math.degrees(SMALLEST_NAME_RAD):
-            norths.append((f"{what} here is {angle_deg:+z.1f}°", math.radians(angle_deg)))
+            norths.append((f"{name} here is {angle_deg:+z.1f}°", math.radians(angle_deg)))
     for turn, turn_text in TURN_WORDS.items():
         for north_text, north in norths:
             away = abs(math.remainder(offset_rad - math.radians(turn) + north, 2 * math.pi))
             texts = [text for text in (turn_text, north_text) if text]
             if away <= max(LIKE_RAD, 2.0 * sigma_rad) and texts:
-                # Fewer causes are more likely; of equally many, the closest ones.
+                # Fewer causes are more likely; among equally many causes the closest ones are.
                 causes.append((len(texts), away, " and ".join(texts)))
     return OffsetName(min(causes)[2] if causes else "", declination, convergence)
 
@@ -97,7 +105,12 @@ def utm_convergence_deg(datum: Datum) -> float | None:
 
 
 def _declination_deg(datum: Datum, stamp_ns: int) -> float | None:
-    """Return the declination of the World Magnetic Model; None where it does not cover the date."""
+    """Return the declination by the World Magnetic Model [deg], east positive; None where it does not cover the date.
+
+    Notes
+    -----
+    Package pygeomag computes the model (NOAA and British Geological Survey, World Magnetic Model).
+    """
     from pygeomag import GeoMag
 
     day = datetime.fromtimestamp(stamp_ns / 1e9, UTC)
@@ -111,12 +124,16 @@ def _declination_deg(datum: Datum, stamp_ns: int) -> float | None:
 
 
 DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING", "Heading2", "HEADING2")
+"""Parts of the names of message types that state a heading by two antennas."""
 
 SMALLEST_OFFSET_RAD = math.radians(1.0)
+"""Smallest offset of a heading that is significant [rad]."""
+
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
 OTHER_CONVENTION = note(
     "heading_convention_contradicts", f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned"
 )
+"""Finding about a heading whose convention the preset does not correct."""
 
 OF_THE_SENSE = {"heading_convention_contradicts", "heading_convention_corrected"}
 """Codes of findings about the sense of a heading. The offset is stated in the same finding."""
@@ -153,9 +170,10 @@ class CourseComparison(NamedTuple):
     ----------
     windows : number of windows
     agreement : mean resultant length of heading minus course over ground: 1 where they agree, about 0 at random, NaN
-        without windows; mirrored_agreement : the same for a heading of the other handedness
+        without windows
+    mirrored_agreement : agreement of a heading of the other handedness
     turns_about : the heading turns about where the robot drives backwards: it is itself a course over ground
-    duration_s : median duration of a window
+    duration_s : median duration of a window [s]
     """
 
     windows: int
@@ -176,7 +194,7 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
     moved = (np.abs(seen) > third_m) & (np.abs(laid) > third_m)
     if not moved.any():
         return NOT_COMPARED
-    # with a heading of the other handedness the displacement is mirrored about north
+    # With a heading of the other handedness the displacement is mirrored about north.
     angle, turned_over = (
         np.exp(1j * np.angle(distances * np.conj(seen)))[moved] for distances in (laid, np.conj(laid))
     )
@@ -296,7 +314,12 @@ def _correction(
 
 
 def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool) -> tuple[str, OffsetName]:
-    """Return an offset with its deviation, and its cause; `mirrored`: the offset of a yaw of the other convention."""
+    """Return an offset with its deviation in words, and its possible cause.
+
+    Parameters
+    ----------
+    mirrored : the offset is the offset of a yaw of the other convention
+    """
     rest = offset + math.pi / 2 if mirrored else offset
     name = name_offset(rest, std, log.datum, int(log.wheels.stamp_ns[0])) if _significant(rest, std) else NO_NAME
     cause = f" ({name.text})" if name.text else ""
@@ -304,11 +327,13 @@ def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool
 
 
 def _offset_note(text: str, applied: float) -> Note:
+    """Return the finding about an offset, in words, that is corrected by `applied` [rad]."""
     done = f"{-math.degrees(applied):+z.1f}° is applied; frames.heading_offset_deg sets it"
     return note("heading_offset_corrected", f"heading is {text} off the course over ground: {done}")
 
 
 def _significant(offset: float, std: float) -> bool:
+    """Return whether an offset [rad] is larger than `SMALLEST_OFFSET_RAD` and than its uncertainty."""
     return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, EVIDENCE_SIGMAS * std)
 
 
@@ -316,6 +341,11 @@ def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseCo
     """Raise where no convention and no offset make the heading follow the motion of wheels and fixes.
 
     A heading of the other convention that the configuration keeps also scatters. It is used, with a warning.
+
+    Raises
+    ------
+    DataError
+        The heading scatters by more than `UNEXPLAINED_RAD` about the motion, in either sense.
     """
     if fit is not None and fit.heading_scatter > UNEXPLAINED_RAD and not course.mirrored_agreement > SHARED_DIRECTION:
         spread = min(math.degrees(fit.heading_scatter), 180.0)
@@ -324,7 +354,13 @@ def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseCo
 
 
 def refuse_stuck(log: RobotLog) -> None:
-    """Raise where the heading stays constant over much of the distance while the wheels turn the robot."""
+    """Raise where the heading stays constant over much of the distance while the wheels turn the robot.
+
+    Raises
+    ------
+    DataError
+        The heading is constant in turns for more than `STUCK_SHARE` of the distance.
+    """
     stamps, heading, wheels = log.heading.stamp_ns, log.heading.heading_rad, log.wheels
     if len(stamps) < 2 or len(wheels.stamp_ns) < 2:
         return
@@ -351,5 +387,6 @@ def refuse_stuck(log: RobotLog) -> None:
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
+    """Return the error about an unusable heading: the reason, what was found, and what the user can do."""
     advice = "choose another with topics.heading, or use this one with --set frames.heading_offset_deg=0"
     return DataError(log.name, " ".join(filter(None, ("the heading", log.topic("heading"), why))), f"{found}; {advice}")

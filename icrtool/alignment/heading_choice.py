@@ -41,34 +41,37 @@ ATTITUDE_CELL_S, PAIR_CELL_S = 1.0, 0.5
 [s]."""
 
 SHORTEST_BASELINE_M = 0.2
+"""Smallest distance of two antennas whose bearing is used [m]."""
+
 LEAST_ATTITUDE_STD_RAD = math.radians(0.01)
+"""Smallest white noise of an attitude sensor's heading [rad]."""
 
 
 def antenna_bearing(log: RobotLog, turn: TurnRate) -> AbsoluteHeading | None:
     """Return the bearing from the chosen antenna to the furthest other antenna; None without a bearing."""
-    mine, epoch = log.gnss, int(log.wheels.stamp_ns[0])
+    fixes, epoch = log.gnss, int(log.wheels.stamp_ns[0])
     best, baseline_m = None, 0.0
     for topic, other in ((receiver.topic, receiver.fixes) for receiver in log.other_receivers):
-        if min(len(mine.stamp_ns), len(other.stamp_ns)) < 2:
+        if min(len(fixes.stamp_ns), len(other.stamp_ns)) < 2:
             continue
-        t, s = (mine.stamp_ns - epoch) / 1e9, (other.stamp_ns - epoch) / 1e9
+        t, s = (fixes.stamp_ns - epoch) / 1e9, (other.stamp_ns - epoch) / 1e9
         after = np.clip(np.searchsorted(s, t), 1, len(s) - 1)
         near = (t >= s[0]) & (t <= s[-1]) & ~is_hole(np.diff(s))[after - 1]
         there = np.interp(t, s, other.north_m) + 1j * np.interp(t, s, other.east_m)
-        line = (there - (mine.north_m + 1j * mine.east_m))[near]
+        line = (there - (fixes.north_m + 1j * fixes.east_m))[near]
         length = float(np.median(np.abs(line))) if len(line) > 1 else 0.0
-        noise = math.hypot(fix_std_m(mine), fix_std_m(other))
+        noise = math.hypot(fix_std_m(fixes), fix_std_m(other))
         good = np.abs(np.abs(line) - length) < max(5.0 * noise, 0.05 * length)
         short = length < max(SHORTEST_BASELINE_M, 4.0 * noise) or length <= baseline_m
         if not short and np.count_nonzero(good) >= len(good) / 2:
-            cells = _averaged(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
+            cells = _average_cells(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
             part = f"two antennas {length:.2f} m apart"
             best, baseline_m = cells._replace(std=noise / length * cells.std, topic=topic, part=part), length
     return best
 
 
-def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> AbsoluteHeading:
-    """Return means over cells of time, at each cell's last sample; `std` is relative to the noise of a sample.
+def _average_cells(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> AbsoluteHeading:
+    """Return mean headings over cells of time, at each cell's last sample; `std` is a ratio to the noise of a sample.
 
     The turn rate moves the samples of a cell to the cell's end, so that the mean is causal.
     """
@@ -77,7 +80,7 @@ def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> Absolu
     if not len(t):
         return AbsoluteHeading(t, angle, angle, angle)
     turned = np.interp(t, turn.t, turn.integrated)
-    first = rows_of_cells(t, lambda some: np.floor(some / cell_s))
+    first = rows_of_cells(t, lambda times: np.floor(times / cell_s))
     count = np.diff(first, append=len(t))
     last = first + count - 1
     mean = np.add.reduceat(np.exp(1j * (angle - turned)), first)
@@ -113,11 +116,13 @@ class DerivedHeading:
 
     Attributes
     ----------
-    source : its kind, as in `HeadingFacts`; topic : topics of its parts
-    estimate : causal and smoothed heading; causal, smoothed : both as samples; the filter uses the causal ones
-    gyro : the turn rate that was used, None if the wheels' turn rate was used
+    source : source of the heading, as in `HeadingFacts`
+    topic : topics of the sensors, joined by " + "
+    estimate : causal and smoothed heading with their standard deviations
+    causal, smoothed : the headings of the estimate as samples; the filter uses the causal ones
+    gyro : the turn rate that was used; None if the wheels' turn rate was used
     attitude : the attitude sensor's own heading, corrected by the offset of the estimate; None where none was used
-    why : its parts and standard deviation, for the user
+    why : the sensors and the standard deviation of the heading, for the user
     measured_t : times of courses over ground [s] where fixes are rare and the wheels carry the heading in between; else
         None
     """
@@ -164,7 +169,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         why = "the turn rate drifts more"
     elif log.gyros:
         why = "the turn rate does not cover enough of the drive"
-    by_wheels = _derived(log, track, wheel_rate(track, width_m), None, None, instead=why)
+    by_wheels = _derive_with_rate(log, track, wheel_rate(track, width_m), None, None, instead=why)
     if by_wheels is not None and (by_gyro is None or by_wheels.estimate.median_std < by_gyro.estimate.median_std):
         return by_wheels
     if by_gyro is None:
@@ -186,7 +191,7 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
 
     Parameters
     ----------
-    track : of the log
+    track : track of the log
     """
     if track.same_clock:
         return None
@@ -217,7 +222,8 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
         rates = gyro_rates(track, changes, gyro, epoch)
         # With a stated heading only the usual mounting is tried, because that heading would fit to both senses.
         for row, (turn, axis) in enumerate(rates if stated is None else rates[:1]):
-            candidate = _derived(log, track, turn, gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})", stated)
+            topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
+            candidate = _derive_with_rate(log, track, turn, topic, stated)
             std = math.inf if candidate is None else candidate.estimate.median_std
             std *= 1.0 if row else BETTER_SCATTER_RATIO
             if std < least:
@@ -225,7 +231,7 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
     return best_heading
 
 
-def _derived(
+def _derive_with_rate(
     log: RobotLog, track: Track, turn: TurnRate, gyro_topic: str | None, stated: HeadingSamples | None,
     instead: str = "",
 ) -> DerivedHeading | None:  # fmt: skip
@@ -239,7 +245,7 @@ def _derived(
     if stated is not None:
         # The stated heading gets the white noise that it shows relative to the turn rate.
         measured = track.seen_heading_t
-        attitude_cells = _averaged(measured, track.heading_at(measured), turn, ATTITUDE_CELL_S)
+        attitude_cells = _average_cells(measured, track.heading_at(measured), turn, ATTITUDE_CELL_S)
         step = np.diff(attitude_cells.heading - np.interp(attitude_cells.t, turn.t, turn.integrated))
         noise = mad_std(wrapped(step - np.median(step))) / math.sqrt(2.0) if len(step) else 0.0
         std = np.full(len(attitude_cells.t), max(noise, LEAST_ATTITUDE_STD_RAD))
@@ -266,9 +272,9 @@ def _derived(
         )
     stamps, turn_stamps = (epoch + np.round(t * 1e9).astype(np.int64) for t in (estimate.t, turn.t))
     causal, smoothed = wrapped(estimate.causal), wrapped(estimate.smoothed)
-    # the causal heading begins where it is known, and again after a hole of the turn rate
+    # The causal heading begins where it is known, and begins again after a hole of the turn rate.
     std = estimate.causal_std
-    clear = known_again(estimate.t, std, turn.holes)
+    clear = is_heading_known(estimate.t, std, turn.holes)
     return DerivedHeading(
         source,
         " + ".join(names),
@@ -282,7 +288,7 @@ def _derived(
     )
 
 
-def known_again(t: Floats, std: Floats, holes: Floats) -> Bools:
+def is_heading_known(t: Floats, std: Floats, holes: Floats) -> Bools:
     """Return which causal headings (n,) are known: not the first ones, nor those after a hole, while sigma is large.
 
     The headings that are left out share one error: the error at the start, or the error of the turn in the hole. The
@@ -290,7 +296,9 @@ def known_again(t: Floats, std: Floats, holes: Floats) -> Bools:
 
     Parameters
     ----------
-    t : (n,) [s]; std : (n,) [rad]; holes : (m, 2) [s]
+    t : (n,) stamps of the headings [s]
+    std : (n,) standard deviations of the headings [rad]
+    holes : (m, 2) begins and ends of the holes of the turn rate [s]
     """
     clear = std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(std)))
     is_known, clear_rows = np.ones(len(t), np.bool_), np.flatnonzero(clear)
@@ -310,8 +318,8 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
 
     Parameters
     ----------
-    scatter_rad : of the heading about the course over ground
-    width_m : the track width b
+    scatter_rad : scatter of the heading about the course over ground [rad]
+    width_m : the track width b [m]
     """
     if scatter_rad < NOISY_SCATTER_RAD:
         return None

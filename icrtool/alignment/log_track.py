@@ -119,7 +119,7 @@ def track_of_streams(
     turns = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
     angle = unwrapped(heading.heading_rad)
     if len(heading_t) > MOST_WHEEL_SAMPLES:
-        # neighbours are averaged, so that a delay does not depend on the noise of single samples
+        # Neighbours are averaged, so that a delay does not depend on the noise of single samples.
         begin, behind = runs_of(turns)
         first = _thinned(in_spans(heading_t, wheel_t[begin] - STANDS_S, wheel_t[behind - 1] + STANDS_S))
         count = np.diff(first, append=len(heading_t))
@@ -130,7 +130,7 @@ def track_of_streams(
         none, none, none, same_clock=same_clock,
     )  # fmt: skip
     if len(wheel_t) > MOST_WHEEL_SAMPLES:
-        # gaps are not joined with other samples
+        # Gaps are not joined with other samples.
         begins = (held == 0.0) | np.append(True, held[:-1] == 0.0)
         begins[_thinned(turns)] = begins[-1] = True
         track = track.joined(np.flatnonzero(begins))
@@ -213,7 +213,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
     usable = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_ALIGNMENT_WINDOW_S)
     usable &= at[end] - at[begin] < 2.0 * length
     begin, end, lengths = begin[usable], end[usable], windows.length_m[usable]
-    # windows of time in which wheels and heading were sampled and the wheels turned
+    # In a window of time, wheels and heading must be sampled and the wheels must turn.
     turn_begin = turn_end = np.empty(0)
     sampled = track.seen_heading_t
     if len(sampled):
@@ -231,7 +231,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
         usable &= np.searchsorted(sampled, turn_end) > np.searchsorted(sampled, turn_begin) + 1
         usable &= np.interp(turn_end, track.t, travel) > np.interp(turn_begin, track.t, travel)
         turn_begin, turn_end = turn_begin[usable], turn_end[usable]
-    # windows that count as one independent observation: 10 windows, where there are 40 of them
+    # Windows within `size` count as one independent observation: 10 windows, where the drive has 40 of this size.
     size = min(max(float(travel[-1]) / 40.0, 2.0 * length), 10.0 * length)
     turn_travel = np.interp(turn_begin, track.t, travel)
     return DriveWindows(
@@ -294,21 +294,21 @@ def check_streams(log: RobotLog) -> None:
     wheels, gnss, heading = log.wheels, log.gnss, log.heading
     if not len(heading.stamp_ns):
         raise DataError(log.name, "no orientation in it", "use preset field, which estimates the heading")
-    for what, stamps, values, variances in (
+    for name, stamps, values, variances in (
         ("wheel", wheels.stamp_ns, (wheels.v_left_mps, wheels.v_right_mps), ()),
         ("position", gnss.stamp_ns, (gnss.north_m, gnss.east_m), (gnss.var_north_m2, gnss.var_east_m2)),
         ("heading", heading.stamp_ns, (heading.heading_rad,), (heading.var_rad2,)),
     ):
         if len(stamps) < 2:
-            raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
+            raise DataError(log.name, f"{len(stamps)} usable {name} samples", "a run needs at least two of each stream")
         back = stamps < np.append(stamps[:1], stamps[:-1])
         bad = np.logical_or.reduce([~np.isfinite(values_of) for values_of in values])
         negative = np.logical_or.reduce([np.zeros(len(stamps), np.bool_), *(values_of < 0 for values_of in variances)])
         count = np.count_nonzero(bad)
         for rows, fault, advice in (
-            (back, f"the {what} stamps go back at row", "sort the rows by stamp"),
-            (bad, f"{count} {what} samples are not finite numbers, the first at row", "leave those rows out"),
-            (negative, f"a {what} variance is negative, the first at row", "NaN stands for unknown"),
+            (back, f"the {name} stamps go back at row", "sort the rows by stamp"),
+            (bad, f"{count} {name} samples are not finite numbers, the first at row", "leave those rows out"),
+            (negative, f"a {name} variance is negative, the first at row", "NaN stands for unknown"),
         ):
             if rows.any():
                 raise DataError(log.name, f"{fault} {rows.argmax()}", advice)
@@ -320,5 +320,5 @@ def check_streams(log: RobotLog) -> None:
         raise DataError(log.name, f"a position {farthest:.2g} m from the origin", "are the positions in metres?")
     spans = {"wheel": wheels.stamp_ns, "position": gnss.stamp_ns, "heading": heading.stamp_ns}
     if max(int(s[0]) for s in spans.values()) >= min(int(s[-1]) for s in spans.values()):
-        spans_text = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in spans.items())
+        spans_text = ", ".join(f"{name} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for name, s in spans.items())
         raise DataError(log.name, "wheels, position and heading do not overlap in time", spans_text)

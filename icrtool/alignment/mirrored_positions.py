@@ -78,18 +78,18 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
     near = [candidate for candidate, cost in zip(candidates, costs, strict=True) if cost < min(costs) + DECISIVE]
     if by_gyro:
         # Without a heading nothing decides between exchanges that fit equally well: their paths differ by a turn.
-        what, right = " or ".join(words for _, words, _ in near), near[0][2]
+        exchange, corrected = " or ".join(words for _, words, _ in near), near[0][2]
         witnesses = "gyro and wheels, which agree"
-        what += " (or the gyro is upside down, and the sides are exchanged)"
+        exchange += " (or the gyro is upside down, and the sides are exchanged)"
     else:
         # The offset of the heading decides between exchanges that fit equally well.
-        _, what, right = min(near, key=lambda candidate: abs(candidate[0].offset_rad))
+        _, exchange, corrected = min(near, key=lambda candidate: abs(candidate[0].offset_rad))
         witnesses = "gyro, heading and wheels, which agree"
     why = (
-        f"the positions turn in the opposite sense to {witnesses}: {what}; corrected "
+        f"the positions turn in the opposite sense to {witnesses}: {exchange}; corrected "
         f"(twice the gain in log-likelihood {gain:.0f}, decisive from {DECISIVE:.0f} on)"
     )
-    return replace(right, notes=(*right.notes, note("positions_mirrored", why, log.name)))
+    return replace(corrected, notes=(*corrected.notes, note("positions_mirrored", why, log.name)))
 
 
 def _exchanged_by_distance(log: RobotLog, named: RobotLog) -> RobotLog:
@@ -161,6 +161,7 @@ def _exchanged(log: RobotLog, datum: Datum, exchange: Callable[[PositionFixes], 
 
 
 def _other_longitude(log: RobotLog, datum: Datum) -> RobotLog | None:
+    """Return the log with the other sign of its longitudes."""
     return _exchanged(
         log, replace(datum, longitude_deg=-datum.longitude_deg),
         lambda fixes: replace(fixes, east_m=-fixes.east_m, cov_north_east_m2=-fixes.cov_north_east_m2),
@@ -168,6 +169,7 @@ def _other_longitude(log: RobotLog, datum: Datum) -> RobotLog | None:
 
 
 def _other_latitude(log: RobotLog, datum: Datum) -> RobotLog | None:
+    """Return the log with the other sign of its latitudes."""
     return _exchanged(
         log, replace(datum, latitude_deg=-datum.latitude_deg),
         lambda fixes: replace(fixes, north_m=-fixes.north_m, cov_north_east_m2=-fixes.cov_north_east_m2),

@@ -43,8 +43,11 @@ MOTION_WINDOW_M = 1.0
 windows."""
 
 LEAST_TURN_GAIN = 1e-3
+"""Smallest ratio of the robot's turn to its wheels' turn that the ICR separation is computed from."""
 
 WINDOWS_S = (0.5, 1.0, 2.0)
+"""Durations of the windows that are always compared [s]."""
+
 LONGEST_MOTION_WINDOW_S = 16.0
 """Longest window [s]. Windows are doubled up to this time where the fixes are too noisy for shorter ones."""
 
@@ -55,6 +58,8 @@ LEAST_DISTANCE2 = 36.0
 """Squared Mahalanobis distance from which on a window shows an event."""
 
 LEAST_MODEL_ERROR = 0.03
+"""Smallest standard deviation of the model's error, as a share of the wheels' motion."""
+
 FIRST_QUANTILE, LATER_QUANTILE = 0.7, 0.95
 """Quantiles of the windows' residuals from which the model's error is computed: in the first round, and in later
 rounds. In the first round the windows still include events."""
@@ -71,12 +76,16 @@ class Knots(NamedTuple):
 
     Attributes
     ----------
-    track : with these fixes alone, since `epoch_ns`; its distance is the wheels' distance
-    variance : (m,) of a place, one axis [m^2]
-    heading : (m,) [rad], unwrapped; turn_variance : variance of one heading [rad^2]
-    velocity : complex (m,), the mean of the sides along the heading [m/s]; apart : (m,) left minus right [m/s]
-    held_m2 : (m,) variance that values held from sample to sample add to a side's distance
-    holes : (m,) number of earlier steps that touch a hole of any stream; wheel_holes : of the wheels
+    epoch_ns : stamp from which times count [ns]
+    track : track of the log with these fixes alone; its distance is the wheels' distance
+    variance : (m,) variance of a fix on one axis [m^2]
+    heading : (m,) heading, unwrapped [rad]
+    turn_variance : variance of one heading [rad^2]
+    velocity : complex (m,) mean velocity of the sides along the heading, north + j east [m/s]
+    apart : (m,) speed of the left side minus speed of the right side [m/s]
+    held_m2 : (m,) variance that values held from sample to sample add to a side's distance [m^2]
+    holes : (m,) number of earlier steps that touch a hole of any stream
+    wheel_holes : (m,) number of earlier steps that touch a hole of the wheels
     fix_class : (m,) classes of the fixes
     turn_follows_place : the headings are estimated from the positions, and jump with them
     gyro : (m,) turn of the gyro [rad], in sense and scale of the headings; None without a gyro that agrees with them
@@ -103,12 +112,14 @@ class Knots(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motion that an estimate expects at the knots.
+    """Motion by the wheels at the knots, with the scale and the turn gain of an estimate.
 
     Attributes
     ----------
-    place : complex (m,) [m], turn : (m,) [rad], of the wheels, as integrals
-    scale : of the wheels; lever_m : half the ICR separation, which makes a turn a distance
+    place : complex (m,) displacement since the first knot, north + j east [m]
+    turn : (m,) turn since the first knot, clockwise [rad]
+    scale : distance of the robot per distance that the wheels report
+    lever_m : half the ICR separation [m]; a turn times this lever is a distance
     """
 
     place: Complexes
@@ -118,7 +129,7 @@ class Motion(NamedTuple):
 
 
 class ComparedWindows(NamedTuple):
-    """Motion of the reference minus the model's, in windows between two knots.
+    """Motion of the reference minus the motion by the model, in windows between two knots.
 
     Attributes
     ----------
@@ -147,7 +158,7 @@ class ComparedWindows(NamedTuple):
         return np.column_stack([self.ahead, self.aside, self.turned])
 
     @property
-    def of_sides(self) -> Floats:
+    def side_residual(self) -> Floats:
         """Reference minus model of the left and of the right side (2, w) [m]."""
         return np.stack([self.ahead + self.turned, self.ahead - self.turned])
 
@@ -157,7 +168,7 @@ class ComparedWindows(NamedTuple):
         return np.stack([self.model_ahead + self.model_turned, self.model_ahead - self.model_turned])
 
     def rows(self, rows: Bools | slice) -> ComparedWindows:
-        """Return some of the windows."""
+        """Return the windows in some rows."""
         return ComparedWindows._make(column[rows] for column in self)
 
 
@@ -239,11 +250,12 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
 
     Parameters
     ----------
+    width_m : the track width b [m]
     quiet : (m,) knots that may be inside a window
     """
-    # Intervals between knots that no window may span.
-    left_out = ~(quiet[1:] & quiet[:-1]) | (np.diff(knots.holes) > 0)
-    windows = cut_drive_windows(knots.track._replace(slipping=np.append(left_out, False)), MOTION_WINDOW_M)
+    # No window spans these intervals between knots.
+    is_excluded = ~(quiet[1:] & quiet[:-1]) | (np.diff(knots.holes) > 0)
+    windows = cut_drive_windows(knots.track._replace(slipping=np.append(is_excluded, False)), MOTION_WINDOW_M)
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
     begin, end = np.searchsorted(knots.t, [windows.turn_begin, windows.turn_end]).clip(0, len(knots.t) - 1)
     undisturbed = (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])
@@ -258,7 +270,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
 
 
 def compare_with_wheels(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: float) -> ComparedWindows:
-    """Return the motion of the reference minus the wheels' between rows of the knots (w,).
+    """Return the motion of the reference minus the motion of the wheels between rows of the knots (w,).
 
     Parameters
     ----------
@@ -290,7 +302,7 @@ def _held_variance(t: Floats, v_left: Floats, v_right: Floats) -> Floats:
     change = np.hypot(np.diff(v_left), np.diff(v_right))
     changed = np.flatnonzero(change > 0) + 1
     held = np.diff(t[np.concatenate([[0], changed])])
-    # values of a standing robot do not count as held
+    # Values of a standing robot do not count as held.
     held = np.minimum(held, LONGEST_HELD_IN_USUAL * float(np.median(held)) if len(held) else 0.0)
     variance = np.zeros(len(t))
     variance[changed] = (change[changed - 1] * held) ** 2 / 12
@@ -359,16 +371,16 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
 
     Parameters
     ----------
-    knots, first : of `without_jumps`
+    knots, first : result of `without_jumps`: the knots, and the rows before the steps
     motion : motion by the wheels
     """
     last = first + 1
     windows = compare_with_wheels(knots, motion, first, last, 0.0)
     duration = knots.t[last] - knots.t[first]
     speed = np.diff(knots.track.distance) / np.diff(knots.t)
-    # Largest speed of the wheels; single samples do not count.
+    # The speed of the wheels is a quantile, so that single samples do not count.
     slide = (SLIDE_MPS + motion.scale * float(np.quantile(speed, 0.99))) * duration
-    # motion of the wheels in the time by which stamps may be wrong, before and after each step
+    # `jitter` and `spin` are motion of the wheels in the time by which stamps may be wrong, before and after each step.
     reach = (knots.t[last] + 3 * STAMP_STD_S, knots.t[first] - 3 * STAMP_STD_S)
     jitter, spin = (
         np.abs(np.interp(reach[0], knots.t, along) - np.interp(reach[1], knots.t, along) - (along[last] - along[first]))
@@ -384,7 +396,7 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     if knots.gyro is None:
         alone[:] = False
     else:
-        # the gyro's turn is closer to the wheels' turn than to the reference's
+        # The gyro's turn must be closer to the wheels' turn than to the reference's turn.
         by_gyro = motion.lever_m * (knots.gyro[last] - knots.gyro[first])
         slipped = np.abs(by_gyro - windows.model_turned)
         alone &= slipped < np.minimum(JUMP_MPS * duration, np.abs(windows.turned) / 2)

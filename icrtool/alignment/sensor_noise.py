@@ -20,6 +20,8 @@ FEWEST_NOISE_STEPS = 40
 """Smallest number of steps that show noise, and number of fixes in a stretch."""
 
 FEWEST_FIXES = 30
+"""Smallest number of fixes whose noise and motion are compared."""
+
 MEDIAN_OF_RAYLEIGH = 1.1774
 """Ratio of the median of a Rayleigh distribution to its scale."""
 
@@ -30,11 +32,14 @@ JUMP_SIGMAS = 8.0
 """Size of a step, in robust standard deviations, above which it is a jump or a spike."""
 
 SMALLEST_JUMP_M = 0.1
+"""Smallest jump of the positions [m]."""
+
 PERSISTS_S = 1.0
+"""Time before and after a step over which the median positions are compared [s]."""
+
 PERSISTS_SHARE = 0.5
-"""Smallest jump [m]; time before and after a step over which the median positions are compared [s]; largest difference
-between the step and the change of these medians, as a share of the step, at which the step is a jump. After an outlier
-the positions come back."""
+"""Largest difference between a step and the change of these medians, as a share of the step, at which the step is a
+jump. After an outlier the positions come back."""
 
 NOISIER = 1.5
 """Ratio of measured to stated noise above which the measured noise is used."""
@@ -102,7 +107,9 @@ def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Compl
 
     Parameters
     ----------
-    t : (m,) [s]; place : complex (m,) of the fixes [m], or a heading [rad]; expected : (m,) by the wheels, as integrals
+    t : (m,) stamps of the fixes [s]
+    place : complex (m,) positions of the fixes, north + j east [m]; or float64 (m,) headings [rad]
+    expected : (m,) positions or headings by the wheels alone, as integrals, in the same unit
     """
     step, dt = np.diff(place - expected).astype(np.complex128), np.diff(t)
     if len(step) < 2:
@@ -126,7 +133,7 @@ def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Compl
         return FixSteps(step, product, moves, row)
     level = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step))])
     around = sliding_window_view(level, span)
-    # level[k] is fix k's; the step k leads from fix k to fix k + 1
+    # `level[k]` belongs to fix k; step k leads from fix k to fix k + 1.
     before, after = around[row - span + 1], around[row + 1]
     change = np.median(after.real, axis=1) - np.median(before.real, axis=1)
     shift = change + 1j * (np.median(after.imag, axis=1) - np.median(before.imag, axis=1))
@@ -157,10 +164,10 @@ def without_bad_start(log: RobotLog) -> RobotLog:
     if len(gnss.stamp_ns) < 4 * FIRST_FIXES or len(wheels.stamp_ns) < 2:
         return log
     if not all(np.isfinite(column).all() for column in (gnss.north_m, gnss.east_m, wheels.left, wheels.right)):
-        # refused later
+        # A log with damaged positions or speeds is refused later, with the reason.
         return log
     seconds = np.diff(gnss.stamp_ns[: 4 * FIRST_FIXES]) / 1e9
-    with np.errstate(over="ignore"):  # positions of damaged logs: an infinite step is a jump
+    with np.errstate(over="ignore"):  # In a damaged log a step may be infinite; such a step is a jump.
         step = np.hypot(np.diff(gnss.north_m[: 4 * FIRST_FIXES]), np.diff(gnss.east_m[: 4 * FIRST_FIXES]))
     speed = float(np.quantile(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps), 0.99)) / 2
     noise = NOISIER * (float(np.median(step[FIRST_FIXES:])) + USUAL_POSITION_STD_M)

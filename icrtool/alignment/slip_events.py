@@ -68,7 +68,10 @@ RETURN_SIGMAS = 5.0
 """Ratio of the missing motion to its noise from which on such a return is looked for."""
 
 SHORTEST_EVENT_S = 0.5
+"""Shortest duration of an event [s]."""
+
 FEWEST_EVENT_STEPS = 2
+"""Smallest number of steps from fix to fix in an event."""
 
 MOST_EVIDENCE = 4.0
 """Largest evidence of one step for or against an event. A jump is therefore not an event."""
@@ -95,8 +98,8 @@ def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
 
     Parameters
     ----------
-    sensors : aligned: sides, signs, scale, conventions and delays corrected
-    width_m : distance b between the track centre lines, or a value used in place of it
+    sensors : aligned sensors: sides, signs, scale, conventions and delays are corrected
+    width_m : distance b between the track centre lines [m], or a value used in place of it
 
     Returns
     -------
@@ -118,7 +121,7 @@ def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
 
     Steps from fix to fix that may be jumps (`icrtool.alignment.reference_motion`) are in no window.
     """
-    # exact data, or intervals of very different lengths, may not separate the parameters of the motion
+    # Exact data, or intervals of very different lengths, may not separate the parameters of the motion.
     with suppress(np.linalg.LinAlgError):
         knots = lay_knots(sensors)
         if knots is None:
@@ -147,8 +150,9 @@ def _find_events(
 
     Parameters
     ----------
-    compared : of `compare_by_duration`
-    quiet : (m,) knots from which the model's error is estimated; the next parameter is the quantile for it
+    compared : result of `compare_by_duration`
+    quiet : (m,) knots from which the model's error is estimated
+    quantile : quantile of the residuals from which the model's error is computed
     """
     windows, distance2, false_rate, error = _weigh(compared, quiet, quantile)
     row, outside = np.arange(len(knots.t)), np.ones(len(knots.t), np.bool_)
@@ -200,23 +204,23 @@ def _weigh(
     error = np.full(3, LEAST_MODEL_ERROR)
     for duration, windows in compared:
         error = model_error(windows, quiet, quantile)
-        # while the robot parks, sensors without noise leave no variance to divide by
+        # While the robot parks, sensors without noise leave no variance to divide by.
         moving = windows.rows(windows.path_m > MOVES_MPS * duration)
         missed2 = moving.residual**2
         square = (missed2 / (moving.sensor + (error * moving.path_m[:, None]) ** 2)).sum(axis=1)
         drives = np.abs(moving.model_ahead) > np.abs(moving.model_turned)
-        least = np.where(_of_one_side(moving) & drives, LEAST_OF_SIDE, LEAST_SHARE)
+        least = np.where(_is_one_sided(moving) & drives, LEAST_OF_SIDE, LEAST_SHARE)
         shows = (square > LEAST_DISTANCE2) & (np.sqrt(missed2.sum(axis=1)) > least * moving.path_m)
         shown.append((moving.rows(shows), square[shows]))
     windows = ComparedWindows._make(map(np.concatenate, zip(*(compared for compared, _ in shown), strict=True)))
     square, beyond = np.concatenate([square_of_part for _, square_of_part in shown]), _exceeds(windows)
-    # a robot that stands still is rarer than slip, and so is its opposite: twice the motion of the wheels
+    # A robot that stands still is rarer than slip, and so is its opposite: twice the motion of the wheels.
     doubled = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
     doubled = np.maximum(doubled, np.abs(windows.turned - windows.model_turned))
     still, twice = (far < IMMOBILISED_SHARE * windows.path_m for far in (windows.made, doubled))
-    of_stuck = _false_rate(windows, square, still, twice)
-    of_others = _false_rate(windows, square, ~beyond & ~still, beyond)
-    return windows, square, np.where(still, of_stuck, np.where(beyond, np.inf, of_others)), error
+    still_rate = _false_rate(windows, square, still, twice)
+    other_rate = _false_rate(windows, square, ~beyond & ~still, beyond)
+    return windows, square, np.where(still, still_rate, np.where(beyond, np.inf, other_rate)), error
 
 
 def _exceeds(windows: ComparedWindows) -> Bools:
@@ -231,14 +235,14 @@ def _exceeds(windows: ComparedWindows) -> Bools:
         missed = -np.sign(model) * residual
         return np.asarray((missed < -least) | (missed > np.abs(model) + least))
 
-    of_side = beyond(windows.model_sides, windows.of_sides).any(axis=0)
-    of_all = beyond(windows.model_ahead, windows.ahead) | beyond(windows.model_turned, windows.turned)
-    return of_side & of_all & ~_of_one_side(windows)
+    side_exceeds = beyond(windows.model_sides, windows.side_residual).any(axis=0)
+    robot_exceeds = beyond(windows.model_ahead, windows.ahead) | beyond(windows.model_turned, windows.turned)
+    return side_exceeds & robot_exceeds & ~_is_one_sided(windows)
 
 
-def _of_one_side(windows: ComparedWindows) -> Bools:
-    """Return in which windows one side follows its wheels. The other side has no grip and may be dragged along."""
-    sides = np.abs(windows.of_sides)
+def _is_one_sided(windows: ComparedWindows) -> Bools:
+    """Return in which windows (w,) one side follows its wheels. The other side has no grip and may be dragged along."""
+    sides = np.abs(windows.side_residual)
     return np.asarray(sides.min(axis=0) < KEEPING_SHARE * sides.max(axis=0))
 
 
@@ -248,8 +252,8 @@ def _false_rate(windows: ComparedWindows, distance2: Floats, targets: Bools, dec
     Windows that overlap count as one, with the largest of their distances.
     """
     beyond = []
-    for kind in (decoys, targets):
-        order = np.flatnonzero(kind)[np.argsort(windows.begin[kind], kind="stable")]
+    for rows in (decoys, targets):
+        order = np.flatnonzero(rows)[np.argsort(windows.begin[rows], kind="stable")]
         apart = windows.begin[order][1:] >= np.maximum.accumulate(windows.end[order])[:-1]
         runs = np.flatnonzero(np.append(True, apart)[: len(order)])
         clearest = np.sort(np.maximum.reduceat(distance2[order], runs)) if len(order) else np.empty(0)
@@ -265,7 +269,7 @@ def _is_slip(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
     only one side has no grip, the severity is the root mean square over both sides.
     """
     inside = steps.rows(slice(extent.first, extent.last))
-    sides, noise2 = inside.of_sides, inside.sensor[:, 0] + inside.sensor[:, 2]
+    sides, noise2 = inside.side_residual, inside.sensor[:, 0] + inside.sensor[:, 2]
     total, each = np.abs(sides.sum(axis=1)), np.sqrt(np.maximum(sides**2 - noise2, 0.0)).sum(axis=1)
     keeping, missing = np.argsort(total)
     steady = total[missing] > STEADY_SHARE * each[missing] and total[keeping] < KEEPING_SHARE * total[missing]
@@ -294,15 +298,15 @@ def _returns(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
 
 
 class Extent(NamedTuple):
-    """One event.
+    """Begin, end and size of an event.
 
     Attributes
     ----------
-    first, last : rows of the knots around it
-    begin_s, end_s : times within one step of these knots
+    first, last : rows of the knots before and after the event
+    begin_s, end_s : begin and end of the event [s], within one step of these knots
     kind : immobilised; else slip, skid or spin, by the largest part of the missing motion
     severity : share of the motion of both sides that is missed, or made sideways if that is more; at most 1
-    distance_m : the robot's path through the event
+    distance_m : length of the robot's path through the event [m]
     """
 
     first: int
@@ -322,9 +326,9 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
 
     Parameters
     ----------
-    t : (m,) [s] of the knots
+    t : (m,) times of the knots [s]
     steps : (m - 1,) windows between neighbouring knots
-    error : (3,) of the motion model, a share of the wheels' motion
+    error : (3,) error of the motion model, a share of the wheels' motion
     usable : (m - 1,) steps outside of holes and of other events
     core : rows of the steps of the window
     """
@@ -337,7 +341,7 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
         last = int(np.argmax(grown)) + 1
         if grown[last - 1] <= 0.0:
             return None
-        # Of all parts with this sum, the shortest.
+        # The shortest of all parts with this sum is taken.
         first = core.start + last - 1 - int(np.argmin(sums[:last][::-1]))
         last += core.start
         last += _growth(steps, error, shares, usable, range(last, len(usable)))
@@ -363,7 +367,7 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
     # Where the wheels stand, no motion can be missing; rounding must not count as evidence.
     if not steps.path_m[span].any():
         return None
-    return _measured(steps.rows(span), span, shares, begin_s, end_s)
+    return _measure_extent(steps.rows(span), span, shares, begin_s, end_s)
 
 
 NO_VARIANCE = float(np.finfo(np.float64).tiny)
@@ -377,13 +381,14 @@ def _missed_shares(steps: ComparedWindows) -> Floats:
     fix remains.
     """
     moved = np.concatenate([steps.model_sides, [steps.path_m]])
-    missed = -np.concatenate([steps.of_sides, [steps.aside]])
+    missed = -np.concatenate([steps.side_residual, [steps.aside]])
     size, noise = np.abs(moved).sum(axis=1), steps.sensor.sum(axis=1).mean()
     shares: Floats = (np.sign(moved) * missed).sum(axis=1) * size / np.maximum(size**2 + noise, NO_VARIANCE)
     return shares
 
 
-def _measured(steps: ComparedWindows, span: slice, shares: Floats, begin_s: float, end_s: float) -> Extent:
+def _measure_extent(steps: ComparedWindows, span: slice, shares: Floats, begin_s: float, end_s: float) -> Extent:
+    """Return the event in a span of steps whose sides miss some shares of their motion: its kind and severity."""
     sides, path = steps.model_sides, float(steps.path_m.sum())
     missed = shares[:2, None] * sides
     aside = abs(float(shares[2])) * path

@@ -178,7 +178,9 @@ def spans_of_measured(measured_t: Floats, least_s: float, intervals: int) -> tup
 
     Parameters
     ----------
-    least_s : shortest span [s]; intervals : smallest number of intervals in a span
+    measured_t : (n,) stamps of the measured headings [s]
+    least_s : shortest span [s]
+    intervals : smallest number of intervals in a span
     """
     begin = np.arange(len(measured_t))
     end = np.maximum(begin + intervals, np.searchsorted(measured_t, measured_t + least_s - 1e-9))
@@ -225,9 +227,9 @@ def without_interpolated(log: RobotLog) -> RobotLog:
     if np.count_nonzero(curves) < FEWEST_IN_CURVES or float(straight[curves].mean()) < INTERPOLATED_SHARE:
         return log
     heading = log.heading
-    alike = log.heading_is_of_position and np.array_equal(heading.stamp_ns, stamps)
+    same_stamps = log.heading_is_of_position and np.array_equal(heading.stamp_ns, stamps)
     turn_straight, turn_bend, turns = _straight_turns(heading)
-    if turns and alike:
+    if turns and same_stamps:
         straight, bend = straight & turn_straight, bend + turn_bend
     kept = _nodes(~straight, bend)
     apart_s = float(np.median(np.diff(t[kept])))
@@ -238,7 +240,7 @@ def without_interpolated(log: RobotLog) -> RobotLog:
     rows = np.zeros(len(stamps), np.bool_)
     rows[kept] = True
     finding = note("positions_interpolated", why, log.name)
-    if alike:
+    if same_stamps:
         heading = heading.cut(rows)
     elif turns:
         rows_of_heading = np.zeros(len(turn_straight), np.bool_)

@@ -30,6 +30,9 @@ from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.samples import GyroAxes
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
+"""Length of a window: at least [m]; usually, in standard deviations of a position; on a short drive at least, in
+standard deviations of a position."""
+
 ENOUGH_COURSES = 24.0
 """Number of windows that a short drive is cut into, by shortening them. On a longer drive the noise of the fixes sets
 the length of the windows."""
@@ -55,7 +58,6 @@ ICRs that are 1 m apart has 0.2."""
 LONGEST_STRETCH_S = 60.0
 """Longest duration of two displacements, and longest time between them, to compare them without a turn rate [s]."""
 
-
 LEAST_HOLE_STD_RADPS = math.radians(10.0)
 """Smallest standard deviation of a turn rate that nothing measured [rad/s]."""
 
@@ -66,11 +68,12 @@ class TurnRate:
 
     Attributes
     ----------
-    t : (n,) [s]; rate : (n,) [rad/s]
-    holes : (m, 2) begins and ends of stretches [s] in which it was not measured
-    scale_std, bias_std : deviations of its scale and bias before the log
-    hole_std : deviation of the rate within each hole (m,), or within all of them [rad/s]
-    delay_std_s : deviation of its stamps, None: half an interval
+    t : (n,) stamps [s]
+    rate : (n,) turn rate [rad/s]
+    holes : (m, 2) begins and ends of stretches [s] in which the rate was not measured
+    scale_std, bias_std : standard deviations of the rate's scale, and of its bias [rad/s], before the log
+    hole_std : standard deviation of the rate within each hole (m,), or within all holes [rad/s]
+    delay_std_s : standard deviation of the stamps [s]; None: half an interval
     """
 
     t: Floats
@@ -99,10 +102,11 @@ class Guess(NamedTuple):
 
     Attributes
     ----------
-    bias : (n,) of the turn rate at its samples [rad/s]
-    x : ICR ahead of the antenna [m]; delay_s : of the positions
-    middle : derivative of the antenna's speed by half the speed difference of the sides (left - right)
+    bias : (n,) bias of the turn rate at its samples [rad/s]
     bias_std, scale_std : standard deviations of bias [rad/s] and scale
+    x : distance of the ICRs ahead of the antenna [m]
+    delay_s : delay of the positions [s]
+    middle : derivative of the antenna's speed by half the speed difference of the sides (left - right)
     """
 
     bias: Floats
@@ -114,16 +118,17 @@ class Guess(NamedTuple):
 
 
 class Courses(NamedTuple):
-    """Windows of driven distance; (w,) each.
+    """Courses over ground in windows of driven distance, each array (w,).
 
     Attributes
     ----------
-    begin, end : first and last fix [s]; angle : heading at the end by the fixes [rad]
-    of_x, of_delay, of_bias, of_scale : its derivatives by x_icr, by the delay of the positions, and by bias and scale
-        error of the turn rate
-    std : by the noise of the fixes [rad]
-    length : ratio of the displacement by the fixes to the displacement by the wheels; of_middle : its derivative by
-        `Guess.middle`
+    begin, end : times of the first and of the last fix [s]
+    angle : heading at the end, by the fixes [rad]
+    of_x, of_delay, of_bias, of_scale : derivatives of the angle by x_icr [rad/m], by the delay of the positions
+        [rad/s], by the bias of the turn rate [s] and by its scale error [rad]
+    std : standard deviation of the angle by the noise of the fixes [rad]
+    length : ratio of the displacement by the fixes to the displacement by the wheels
+    of_middle : derivative of the length by `Guess.middle`
     """
 
     begin: Floats
@@ -226,9 +231,14 @@ def fit_middle(courses: Courses, guess: Guess) -> float:
 
 
 def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
-    """Return mid-times (m,) [s] of windows and of the next ones, and the turn of the course over ground between [rad].
+    """Return the turns of the course over ground from each window of distance to the next one.
 
     Only displacements and the sense of the wheels' turning are used, because the heading is not known yet.
+
+    Returns
+    -------
+    middle times (m,) of the earlier windows [s]; middle times (m,) of the later windows [s]; turn (m,) of the course
+    between them, clockwise [rad]
     """
     along = track.cumulate(track.mean_speed)
     length, t, place, begin, end = _cut_courses(track, float(track.t[0]), float(track.t[-1]))
@@ -304,6 +314,9 @@ BETTER_SCATTER_RATIO = 0.9
 the turns of the course over ground, or the standard deviation of the heading."""
 
 LARGEST_CHANGE_RAD = 2.5
+"""Largest turn between two courses that the axis of a gyro is found with [rad]. A larger one may be a turn to the other
+side."""
+
 SHORTEST_HOLE_S = 0.1
 """Shortest interval that is a hole in a turn rate [s]."""
 
@@ -372,7 +385,9 @@ def _axis_by_courses(turned: Floats, seconds: Floats, change: Floats) -> tuple[F
 
     Parameters
     ----------
-    turned : (m, 3) turn about each axis; seconds : (m,) over which; change : (m,) of the course over ground [rad]
+    turned : (m, 3) turn about each axis of the sensor [rad]
+    seconds : (m,) time of the turn [s]
+    change : (m,) turn of the course over ground in this time [rad]
     """
     solution = robust_regression(np.column_stack([turned, seconds]), change, AXIS_PRIOR_STD).x
     size = float(np.linalg.norm(solution[:3]))

@@ -31,6 +31,7 @@ from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import RobotLog
 
 SMALLEST_TURN_RAD = math.radians(20.0)
+"""Smallest range of the heading at which the robot turned [rad]."""
 
 NEVER_MOVES_SHARE, DEAD_M = 0.02, 10.0
 """Ratio of the sides' speeds below which, over this distance [m], the slower side has a dead encoder. No robot turns
@@ -260,21 +261,21 @@ def _find_scales(
         slip = f"over {fit.windows.length_m[0]:.0f} m {apart}, their turns by {100 * fit.turn_slip:.0f} %"
         return (1.0, 1.0), [note("wheels_slip", f"the wheels slip: {slip}; no scale and no delay is corrected")]
     configured = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
-    may = config.filter.rules.corrects and sound and not configured
+    may_correct = config.filter.rules.corrects and sound and not configured
     factor, notes = 1.0, list[Note]()
     scale, std = fit.estimate("scale")
     error, weight = abs(scale - 1.0), USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
-    # twice the log-likelihood with a free scale, minus twice the log-likelihood with scale 1
+    # The sum is twice the log-likelihood with a free scale, minus twice the log-likelihood with scale 1.
     if std <= LARGEST_SCALE_STD and (error / std) ** 2 * weight + math.log1p(-weight) > 0.0:
         if small := error <= LARGEST_SCALE_CORRECTION:
             scale = 1.0 + (scale - 1.0) * weight
         text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
         check = f"{radius_hint(log, config, scale)}wheel radius, encoder resolution and units"
-        if may and small:
+        if may_correct and small:
             factor = scale
             done = "corrected; wheels.left_scale and right_scale set it"
             notes.append(note("wheel_scale_corrected", f"{text}: {done}"))
-        elif may and (finding := wrong_size(Scale(scale, std), log, config)) is not None:
+        elif may_correct and (finding := wrong_size(Scale(scale, std), log, config)) is not None:
             factor = scale
             notes.append(finding)
         else:
@@ -289,7 +290,7 @@ def _find_scales(
     side, other_side = ("left", "right") if difference < 0 else ("right", "left")
     text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other_side} one"
     text = f"{text} where both report the same distance"
-    if not may:
+    if not may_correct:
         return (factor, factor), [*notes, note("side_scale_differs", f"{text}: check wheel radii and tyre pressures")]
     notes.append(note("side_scale_corrected", f"{text}: corrected; wheels.left_scale and right_scale set it"))
     return (factor * (1.0 + difference / 2), factor * (1.0 - difference / 2)), notes
@@ -310,14 +311,14 @@ def _fused_note(log: RobotLog, width_m: float | None) -> list[Note]:
     if not (np.ptp(rate) > 0.1 and np.ptp(turn) > 0 and float(np.corrcoef(rate, turn)[0, 1]) > FUSED_CORRELATION):
         return []
     varies = float(rate.std())
-    of_gyro = float(np.cov(rate, turn, bias=True)[0, 1]) / varies**2
-    std = float((turn - turn.mean() - of_gyro * (rate - rate.mean())).std()) / (varies * math.sqrt(len(rate)))
-    if abs(abs(of_gyro) - 1.0) > max(FUSED_SLOPE, EVIDENCE_SIGMAS * std):
+    slope = float(np.cov(rate, turn, bias=True)[0, 1]) / varies**2
+    std = float((turn - turn.mean() - slope * (rate - rate.mean())).std()) / (varies * math.sqrt(len(rate)))
+    if abs(abs(slope) - 1.0) > max(FUSED_SLOPE, EVIDENCE_SIGMAS * std):
         return []
     noise, shared = np.diff(rate, 2), np.diff(turn, 2)
     if not (noise.any() and shared.any() and abs(float(np.corrcoef(noise, shared)[0, 1])) > SHARED_NOISE):
         return []
-    ratio = f"{abs(of_gyro):.4f} ± {max(std, 0.0001):.4f} of the gyro's turns"
+    ratio = f"{abs(slope):.4f} ± {max(std, 0.0001):.4f} of the gyro's turns"
     fact = f"{stream.topic} turns by {ratio}, with the same noise: it is fused with a gyro, or does not slip at all"
     return [note("wheels_fused", f"{fact}; name the wheels' own topic with topics.wheels")]
 
@@ -331,8 +332,9 @@ class Turns(NamedTuple):
 
     Attributes
     ----------
-    ratio, ratio_std : turn of the heading per turn of the wheels
-    residual_rad : robust scatter of the heading's turn about this ratio; turn_rad : rms turn of the heading
+    ratio, ratio_std : turn of the heading per turn of the wheels, and its standard deviation
+    residual_rad : robust scatter of the heading's turn about this ratio [rad]
+    turn_rad : rms turn of the heading [rad]
     """
 
     ratio: float
@@ -342,12 +344,13 @@ class Turns(NamedTuple):
 
 
 def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Sequence[float]) -> list[Turns]:
-    """Return the turns of heading and wheels over windows of some lengths; empty if a length has too few windows.
+    """Return the turns of heading and wheels for each length of windows; empty if a length has too few windows.
 
     Parameters
     ----------
-    width_m : the track width b
-    delay_s : lag of the heading behind the wheels
+    width_m : the track width b [m]
+    delay_s : lag of the heading behind the wheels [s]
+    windows_s : lengths of the windows [s]
     """
     t, travel, comparisons = track.t, track.travel, list[Turns]()
     turned = track.cumulate(2.0 * track.half_difference / width_m)

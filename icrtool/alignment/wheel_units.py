@@ -107,7 +107,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
         return log
     topic = log.topic("wheels", "wheels")
     try:
-        factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
+        factor, unit_words, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
     except ConfigError:
         refuse_standing(log)
         raise
@@ -137,7 +137,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     if len(stamps) < 2:
         raise DataError(log.name, f"{topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
     streams = tuple(
-        replace(stream, count=len(stamps), why=f"{stream.why}{how}") if stream.role == "wheels" else stream
+        replace(stream, count=len(stamps), why=f"{stream.why}{unit_words}") if stream.role == "wheels" else stream
         for stream in log.streams
     )
     kept = tuple(np.intersect1d(restarts, stamps).tolist())
@@ -155,7 +155,7 @@ def with_right_size(log: RobotLog, config: Config) -> tuple[RobotLog, float]:
     if settings.left_scale != "auto" or settings.right_scale != "auto":
         return log, 1.0
     if not all(np.isfinite(column).all() for column in (log.gnss.north_m, log.gnss.east_m, wheels.left, wheels.right)):
-        # refused later
+        # A log with damaged positions or speeds is refused later, with the reason.
         return log, 1.0
     scale = reference_scale(wheels.stamp_ns, wheels.v_left_mps, wheels.v_right_mps, log.gnss)
     if scale is None or abs(scale.value - 1.0) <= ROLLING_SCALE + EVIDENCE_SIGMAS * scale.std:
@@ -212,9 +212,9 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
 
     Parameters
     ----------
-    windows : of the log. Without windows the robot stands if its positions stay within their noise. A log of a robot on
-        a stand has no windows, because it shows no heading or no unit; a log of a robot that spins on the spot may have
-        windows
+    windows : windows of the log. Without windows the robot stands if its positions stay within their noise. A log of a
+        robot on a stand has no windows, because it shows no heading or no unit; a log of a robot that spins on the spot
+        may have windows
 
     Raises
     ------
@@ -338,7 +338,7 @@ def _metres_per_unit(
     if unit == "rad" and radius is not None and not wheels.from_position and nothing_given:
         scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
         far = scale is not None and scale.value > 0.0 and abs(math.log(scale.value / radius)) >= 2 * UNIT_TOLERANCE
-        # the units in which drivers fill speeds of joints
+        # Drivers fill speeds of joints in these units.
         for other, value in (("m/s", 1.0), ("rpm", 2 * math.pi * radius / 60), ("deg/s", math.radians(radius))):
             if scale is not None and far and abs(math.log(scale.value / value)) < OTHER_UNIT_TOLERANCE:
                 why = f"{topic} is read in {other}, not rad/s: the position reference goes as far in this unit"
@@ -364,14 +364,14 @@ def _metres_per_unit(
             f"needed to read {topic}, which is in {unit}",
             f"give it with --set {lacking}=…; the log has too little driving to estimate it",
         )
-    what = {"rad": "wheel radius", "counts": "travel of a count"}.get(unit, "travel of a unit of the wheels")
-    how = f"{what} {_with_std(scale)} m (estimated from the position reference)"
+    size = {"rad": "wheel radius", "counts": "travel of a count"}.get(unit, "travel of a unit of the wheels")
+    estimate = f"{size} {_with_std(scale)} m (estimated from the position reference)"
     why = (
         f"{topic} names no unit, and none that is known fits (wheels.unit sets it)"
         if unit == "unknown"
         else f"{lacking} is not given"
     )
-    return scale.value, f", {how}", [note("wheel_unit_estimated", f"{why}: {how}")]
+    return scale.value, f", {estimate}", [note("wheel_unit_estimated", f"{why}: {estimate}")]
 
 
 def _recognised(scale: Scale, known: Mapping[WheelUnit, float], radius: float | None) -> tuple[str, float] | None:
@@ -379,7 +379,8 @@ def _recognised(scale: Scale, known: Mapping[WheelUnit, float], radius: float | 
 
     Parameters
     ----------
-    radius : of the wheels, where their speeds may be in rpm or deg/s
+    known : length of each unit that the configuration defines [m]
+    radius : radius of the wheels [m], where their speeds may be in rpm or deg/s
     """
     name, value = min(known.items(), key=lambda item: abs(math.log(scale.value / item[1])))
     if abs(math.log(scale.value / value)) < UNIT_TOLERANCE:

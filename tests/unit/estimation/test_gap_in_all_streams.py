@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from icrtool.alignment.heading_choice import known_again
+from icrtool.alignment.heading_choice import is_heading_known
 from icrtool.alignment.turn_rates import TurnRate
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout
@@ -112,6 +112,6 @@ def test_a_hole_that_the_wheels_do_not_cover_is_as_uncertain_as_the_turns_of_the
 def test_headings_after_a_hole_are_left_out_until_they_are_known() -> None:
     t = np.arange(10.0)
     std = np.array([3.0, 0.01, 0.01, 0.01, 2.0, 2.0, 0.01, 2.0, 0.01, 0.01])
-    known = known_again(t, std, np.array([[3.5, 4.0]]))
+    known = is_heading_known(t, std, np.array([[3.5, 4.0]]))
     np.testing.assert_array_equal(known, [False, True, True, True, False, False, True, True, True, True])
-    np.testing.assert_array_equal(known_again(t, std, np.empty((0, 2))), [False, *[True] * 9])
+    np.testing.assert_array_equal(is_heading_known(t, std, np.empty((0, 2))), [False, *[True] * 9])
