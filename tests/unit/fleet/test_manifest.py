@@ -50,7 +50,7 @@ def test_a_name_with_brackets_is_a_name_where_it_is_there(logs: Path) -> None:
         ("m.csv", "file\na.mcap\n", "column log"),
         ("m.csv", "log,robto\nmon,x\n", "robto"),
         ("m.csv", "log,robot\nmon\n", "m.csv:2"),
-        ("m.csv", "log\nnowhere/*.mcap\n", "matches nothing"),
+        ("m.csv", "log\nnowhere/*.mcap\n", "matches no file or folder"),
         ("m.csv", 'log\n"mon', "not a manifest"),
         ("m.toml", "logs = 3", r"\[\[logs\]\]"),
         ("m.toml", "[[logs]]\nlog = 3", "log"),
