@@ -386,17 +386,20 @@ def _pool_calibration(
     count = math.ceil(len(ordered) * min(1.0, MOST_POOLED_S / max(total_s, 1.0)))
     spaced = {ordered[i].log for i in np.linspace(0, len(ordered) - 1, count).round().astype(int)}
     file = f"{CALIBRATIONS}/{name}.json"
+    chosen = [row for row in members if row.log in spaced and (row.usable or allow_unusable)]
+    if not chosen:
+        reason = "none of its runs is usable; --allow-unusable also takes unusable runs"
+        return replace(empty, left_out=empty.logs, reason=reason)
     opened: dict[str, str] = {}
 
-    def usable() -> Iterator[Run]:
-        for row in members:
-            if row.log in spaced and (row.usable or allow_unusable):
-                run = open_run(place / row.run)
-                opened[row.log] = run.name
-                yield run
+    def open_runs() -> Iterator[Run]:
+        for row in chosen:
+            run = open_run(place / row.run)
+            opened[row.log] = run.name
+            yield run
 
     try:
-        result = calibrate_runs(usable(), allow_unusable=allow_unusable)
+        result = calibrate_runs(open_runs(), allow_unusable=allow_unusable)
         make_folders(Below(directory, CALIBRATIONS))
         formats.write_calibration(result.calibration, Below(directory, file))
     except IcrToolError as err:

@@ -58,7 +58,7 @@ def results(request, stage):
     return replace(request.known, status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
                    inputs=one_log.hashed_files(path))
 
-one_log._results = results
+one_log._fit_and_report = results
 processes.main()
 """
 
