@@ -294,7 +294,7 @@ def convention_notes(decision: Decision, *, corrects: bool, mirrored: bool = Fal
     if convention.swapped:
         other_cause = (
             "; or a latitude or longitude has the wrong sign, or both are exchanged: "
-            "without gyro and heading, the log cannot tell these causes apart"
+            "without gyro and heading, the log cannot distinguish these causes"
         )
         text = f"left and right wheels are swapped{done}{other_cause if mirrored else ''}"
         notes.append(note("sides_swapped", text))
