@@ -172,9 +172,7 @@ def _assemble_choice(survey: Survey, config: Config, choice: Choice) -> RobotLog
         "gnss": (gnss, f"; {place} (/tf_static)" if place else ""),
         "heading": (heading, f"; {convention}"),
     }
-    streams = tuple(
-        _stream_choice(role, chosen_source, *read[role], clock) for role, chosen_source in chosen.items()
-    )
+    streams = tuple(_stream_choice(role, chosen_source, *read[role], clock) for role, chosen_source in chosen.items())
     # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
     others = [
         receiver
