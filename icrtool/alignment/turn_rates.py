@@ -237,8 +237,8 @@ def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
 
     Returns
     -------
-    middle times (m,) of the earlier windows [s]; middle times (m,) of the later windows [s]; turn (m,) of the course
-    between them, clockwise [rad]
+    middle times (m,) of the earlier windows [s]; middle times (m,) of the later windows [s]; turns (m,) of the course
+    over ground between them, clockwise [rad]
     """
     along = track.cumulate(track.mean_speed)
     length, t, place, begin, end = _cut_courses(track, float(track.t[0]), float(track.t[-1]))
