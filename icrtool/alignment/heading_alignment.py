@@ -286,7 +286,8 @@ def _correction(
 
     Parameters
     ----------
-    estimate : offset and its standard deviation [rad]; configured : configured angle to subtract [rad]
+    estimate : offset and its standard deviation [rad]
+    configured : configured angle to subtract [rad]
     """
     offset, std = estimate
     mirrored, corrects = convention.heading < 0, config.filter.rules.corrects

@@ -148,7 +148,7 @@ class ControllerErrors(Record, frozen=True):
     ----------
     pose_variance : (3,) variances of x forward, y left, yaw after 10 m [m^2, m^2, rad^2]
     twist_variance : (3,) variances of the velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
-    turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
+    turn_noise, way_noise : shares of variance: AMCL's alpha1 and alpha2, and AMCL's alpha3 and alpha4
     p95_m, full_p95_m : 95th percentile of the error after 10 m [m], of the controller's model and of the recommended
         model; None without a trial of 10 m
     twist_variance_std : (3,) standard deviations of `twist_variance`; None in files of older versions
@@ -283,7 +283,7 @@ class SensorDocument(CalibrationFile, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    parameters : as `alignment`: the estimates, then estimates derived from them, by the keys of
+    parameters : estimates as in `alignment`, then estimates derived from them, by the keys of
         `icrtool.calibration.sensor_findings.LABELS`
     """
 
@@ -402,13 +402,13 @@ class ComparedGroup(Record, frozen=True):
 
 
 class GroupComparison(Record, frozen=True, kw_only=True):
-    """Groups of runs compared.
+    """Comparison of groups of runs.
 
     Attributes
     ----------
-    pairs : the first group with each of the others
+    pairs : comparisons of the first group with each of the others
     transfer : the transfer matrix, by row, column and horizon
-    costs : of the cells of the matrix off the diagonal
+    costs : costs in the cells of the matrix off the diagonal
     """
 
     schema: Literal["icrtool/compare/1"]

@@ -151,7 +151,7 @@ class EventCostDocument(Record, frozen=True):
     Attributes
     ----------
     events : number of slip events
-    with_events : by model of the filter, the errors of all trials
+    with_events : errors of all trials, by name of the filter's model
     """
 
     events: int
@@ -363,13 +363,14 @@ class Outage:
 
 @dataclass(frozen=True, slots=True)
 class ExampleTrial:
-    """A trial with the reference's path and each model's, for a picture.
+    """A trial with the paths by the reference and by each model, for a picture.
 
     Attributes
     ----------
-    start, end : its first and last state
-    reference_north_m, reference_east_m : (m,)
-    paths : by model name
+    document : numbers of the trial
+    start, end : row of the first and of the last state of the trial
+    reference_north_m, reference_east_m : (m,) path by the reference [m]
+    paths : paths by the models, by name of the model
     """
 
     document: TrialDocument
@@ -388,8 +389,8 @@ class PathErrors:
     ----------
     model : name of the model
     horizon_m : length of the trials
-    start : states (k,) at which they start, increasing
-    error_m : (k,)
+    start : (k,) rows of the states at which the trials start, increasing
+    error_m : (k,) error at the end of each trial [m]
     """
 
     model: str

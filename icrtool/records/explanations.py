@@ -15,7 +15,7 @@ class Explanation(NamedTuple):
 
     Attributes
     ----------
-    grade : of every finding with this code
+    grade : grade of every finding with this code
     cause : what was found, and where it comes from
     consequence : the effect on the numbers
     action : what the user can do

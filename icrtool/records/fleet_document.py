@@ -167,9 +167,10 @@ class FleetCalibration(Record, frozen=True):
     left_out : logs that are not usable, copies, parts of another, or beyond the time that is calibrated together
     file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
     recommended, multiplier, multiplier_std : recommended model and multiplier of the calibration
-    icrs_m : right, left, x of the calibration
-    within_m : distance over which 95 % of the held-out errors stay within `BUDGET_M`; within_beyond : it is a lower
-        bound; within_between_m : the two horizons between which it was interpolated, None in older files
+    icrs_m : right, left and x ICR of the calibration [m]
+    within_m : distance over which 95 % of the held-out errors stay within `BUDGET_M` [m]
+    within_beyond : whether `within_m` is a lower bound
+    within_between_m : the two horizons between which `within_m` was interpolated [m]; None in files of older versions
     table : leave-one-log-out table as text
     key : hash of the logs and their content
     """

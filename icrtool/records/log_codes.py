@@ -19,8 +19,8 @@ OF_FILES: dict[str, Explanation] = {
     ),
     "table_form": Explanation(
         "info",
-        "The columns of a table are parted by semicolons or tabs, perhaps with decimal commas.",
-        "It is read in that form.",
+        "The columns of a table are separated by semicolons or tabs, perhaps with decimal commas.",
+        "The table is read in that form.",
         "None is needed. Check that the table has the named form.",
     ),
     "log_part_unreadable": Explanation(
@@ -38,13 +38,13 @@ OF_FILES: dict[str, Explanation] = {
     "log_parts_contradict": Explanation(
         "warning",
         "Parts of a recording contradict each other: an index, metadata or two descriptions of one topic.",
-        "What the messages themselves state is used; of two descriptions, the first.",
+        "Statements of the messages themselves are used; of two descriptions, the first is used.",
         "Look at the numbers of messages in `icrtool info`. Record again if topics or messages are missing.",
     ),
     "log_more_problems": Explanation(
         "warning",
         "More than 20 problems were found while a file was read.",
-        "Only the first 20 are listed; all were handled alike.",
+        "Only the first 20 are listed; the others were handled in the same way.",
         "Copy the log again from where it was recorded.",
     ),
     "messages_unreadable": Explanation(
@@ -92,8 +92,8 @@ OF_FILES: dict[str, Explanation] = {
     "stamps_shared": Explanation(
         "warning",
         "More than 1 % of the wheel samples have the stamp of another sample.",
-        "Of samples with one stamp the last is used.",
-        "Check whether two publishers send to one topic, or a driver stamps several messages alike.",
+        "The last of the samples with one stamp is used.",
+        "Check whether two publishers send to one topic, or a driver gives several messages one stamp.",
     ),
     "samples_not_finite": Explanation(
         "warning",
@@ -107,7 +107,7 @@ OF_FILES: dict[str, Explanation] = {
 OF_CLOCKS: dict[str, Explanation] = {
     "clock_shifted": Explanation(
         "warning",
-        "Speeds or turns of positions or headings match the wheels' seconds earlier or later: another clock.",
+        "Speeds or turns of positions or headings match the wheels some seconds earlier or later: another clock.",
         "The stream was moved by that time.",
         "Set the clocks of robot and receiver; GPS time is 18 s ahead of UTC.",
     ),
@@ -120,7 +120,7 @@ OF_CLOCKS: dict[str, Explanation] = {
     "clock_set": Explanation(
         "warning",
         "The clock of a computer was set while the log was recorded, or messages are stored out of order.",
-        "Stamps are moved as far as log time shows it, else sorted; errors near that moment can be too large.",
+        "Stamps are moved as far as log time shows the step, else sorted; errors near that time can be too large.",
         "Fit each part alone with `--from` and `--to`. Synchronise the clocks before a recording (chrony, PTP).",
     ),
     "log_time_impossible": Explanation(
@@ -279,9 +279,9 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "wheels_slip": Explanation(
         "warning",
-        "Distance or turns of the wheels differ from the robot's distance or turns by changing amounts.",
+        "Distance or turns of the wheels differ from the robot's distance or turns by changing amounts, as on ice.",
         "No scale and no delay is corrected; the errors without GNSS are large.",
-        "Expected on ice, mud and loose ground. Else check tyres, tracks and encoders.",
+        "None is needed on ice, mud and loose ground. On other ground check tyres, tracks and encoders.",
     ),
     "wheel_scale_corrected": Explanation(
         "info",

@@ -28,9 +28,9 @@ class Finding:
 
     Attributes
     ----------
-    value, std : the estimate and its standard deviation, None where the drive does not show it; the name of the finding
-        ends with the unit
-    applied : the correction that was made to the measurements
+    value, std : the estimate and its standard deviation; None where the drive does not show them. The name of the
+        finding ends with the unit
+    applied : the correction that was made to the measurements, in the same unit
     why : why the correction was made, or why not
     """
 
@@ -46,12 +46,12 @@ class Fixes(Samples):
 
     Attributes
     ----------
-    stamp_ns : int64 (m,), non-decreasing, by the clock of the wheels
-    north_m, east_m : float64 (m,)
-    var_north_m2, var_east_m2 : float64 (m,), finite
-    fix_class : uint8 (m,), keys of `icrtool.alignment.gnss_quality.CLASSES`
-    misreported : bool (m,), whether a fix is reported as RTK-fixed, but is not a fixed solution
-    down_weighted : bool (m,), whether a fix has a larger variance because of its class
+    stamp_ns : int64 (m,) stamps of the wheel clock, non-decreasing [ns]
+    north_m, east_m : float64 (m,) position in the local plane [m]
+    var_north_m2, var_east_m2 : float64 (m,) variances, finite [m^2]
+    fix_class : uint8 (m,) classes, keys of `icrtool.alignment.gnss_quality.CLASSES`
+    misreported : bool (m,) mask of the fixes that are reported as RTK-fixed, but are no fixed solutions
+    down_weighted : bool (m,) mask of the fixes with a larger variance because of their class
     """
 
     stamp_ns: Ints
@@ -84,7 +84,7 @@ class LogFacts(Record, frozen=True, kw_only=True):
         known
     antenna_m : position of the antenna from the body origin, forward and right [m]
     antenna_is_known : the position of the antenna was configured, or is in the log
-    clock_std_s : standard deviation of the time between position and heading, after the correction of delays
+    clock_std_s : standard deviation of the time between position and heading, after the correction of delays [s]
     heading_common_std_rad : standard deviation of the error that all estimated headings share [rad]; 0: not estimated
     heading_sensor : topic of the log that states a heading, also where it is fused with others; None without one
     """
@@ -113,10 +113,12 @@ class SensorData:
     Attributes
     ----------
     name : name of the log
-    headings : clockwise from north, offset corrected; every variance finite
+    wheels : speeds of the sides [m/s]
+    fixes : positions of the antenna
+    headings : headings clockwise from north with corrected offset; every variance is finite
     gyro : turn rates, not used by the filter; None without a gyro
-    facts : everything that is no column and no span of time
-    losses_ns : half-open spans in which RTK was lost, (k, 2)
+    facts : facts of the log that are no column and no span of time
+    losses_ns : (k, 2) half-open spans in which RTK was lost [ns]
     events : slip events, in order of time
     jumps : jumps of the reference, in order of time
     attitude : heading of an attitude sensor after correction of its offset, where `headings` are estimated with this
@@ -150,14 +152,14 @@ class SensorData:
         if len(stamps) > 1:
             near = max(round(MOVING_S * 1e9), 2 * int(np.median(np.diff(stamps), overwrite_input=True)))
         begin, behind = runs_of(turning)
-        # a wheel speed holds until the next sample
+        # A wheel speed holds until the next sample.
         spans = stamps[begin] - near, stamps[np.minimum(behind, len(stamps) - 1)] + near
 
-        def of(stamp_ns: Ints) -> Bools:
+        def is_moving(stamp_ns: Ints) -> Bools:
             moving = in_spans(stamp_ns, *spans)
             return moving if moving.any() else np.ones(len(stamp_ns), np.bool_)
 
-        return of(self.fixes.stamp_ns), of(self.headings.stamp_ns)
+        return is_moving(self.fixes.stamp_ns), is_moving(self.headings.stamp_ns)
 
     def part(self, rows: slice) -> SensorData:
         """Return the sensor data of some wheel samples, with the fixes and headings of the same time."""
@@ -187,7 +189,7 @@ class GroundStretch(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    begin_s, end_s : since the first wheel sample [s]
+    begin_s, end_s : begin and end of the stretch since the first wheel sample [s]
     multiplier, multiplier_std : turn of the wheels per turn of the robot, and its standard deviation
     """
 
@@ -241,12 +243,15 @@ class HeadingFacts(Record, frozen=True, kw_only=True):
     parts : the sensors of an estimated heading, in words; None for a stated heading
     windows : number of stretches of distance in which the heading was compared with the course over ground
     applied_mirror : the sense of the heading was reversed
-    offset_deg, offset_std_deg : heading minus course over ground; None where no window could be compared
-    scatter_deg : robust standard deviation of the differences
-    applied_offset_deg : offset that was subtracted from the heading
-    applied_std_deg : smallest standard deviation of the heading that the filter uses
-    std_deg : median standard deviation of an estimated heading, as the filter uses it; None for a stated heading
+    offset_deg, offset_std_deg : heading minus course over ground, and its standard deviation [deg]; None where no
+        window could be compared
+    scatter_deg : robust standard deviation of the differences [deg]
+    applied_offset_deg : offset that was subtracted from the heading [deg]
+    applied_std_deg : smallest standard deviation of the heading that the filter uses [deg]
+    std_deg : median standard deviation of an estimated heading, as the filter uses it [deg]; None for a stated heading
     offset_name : possible cause of a significant offset
+    magnetic_declination_deg : magnetic declination at the log's place and date, east positive [deg]; None if unknown
+    utm_convergence_deg : UTM grid convergence at the log's place, clockwise [deg]; None if unknown
     agreement, mirrored_agreement : mean resultant length of heading minus course over ground, in either sense
     """
 
@@ -296,7 +301,7 @@ class MeasuredHeading:
     ----------
     kind : ``heading``: the heading of an attitude sensor, used as measured. ``gyro``: an integrated turn rate, which
         starts from the reference heading; its scale and bias are estimated outside the tested block
-    angle_rad : (n,), clockwise, unwrapped [rad]
+    angle_rad : (n,) heading, clockwise, unwrapped [rad]
     """
 
     kind: Literal["heading", "gyro"]
@@ -313,9 +318,9 @@ class SlipEvent(Record, frozen=True):
 
     Attributes
     ----------
-    begin_ns, end_ns : stamps of the wheel clock
-    north_m, east_m : position at the begin, in the local plane
-    distance_m : length of the robot's path through the event, by the position reference
+    begin_ns, end_ns : stamps of the wheel clock [ns]
+    north_m, east_m : position at the begin, in the local plane [m]
+    distance_m : length of the robot's path through the event, by the position reference [m]
     severity : share of the wheels' motion that the robot did not make, 0 to 1
     confidence : probability that model error and sensor noise alone make no such event in the log
     """
@@ -339,11 +344,12 @@ class ReferenceJump(Record, frozen=True):
 
     Attributes
     ----------
-    begin_ns, end_ns : stamps of the wheel clock, from the last pose before to the first after that the filter followed
+    begin_ns, end_ns : stamps of the wheel clock [ns]: of the last pose that the filter followed before the jump, and of
+        the first pose that it followed after the jump
     north_m, east_m : position before the jump, in the local plane [m]
     size_m : largest step of the position during the jump, beyond the motion of the wheels [m]
-    turn_deg : largest step of the heading beyond the turn of the wheels, clockwise; 0 where the heading is not stated
-        with the position
+    turn_deg : largest step of the heading beyond the turn of the wheels, clockwise [deg]; 0 where the heading is not
+        stated with the position
     moved_north_m, moved_east_m : sum of the steps of the position [m]
     why : what shows the jump
     undecided : the jump may be motion of the robot, so trials that cross the jump count

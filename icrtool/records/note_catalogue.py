@@ -131,7 +131,7 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
         "grave",
         "The wheels explain almost none of the turns.",
         "The ICRs mean nothing.",
-        "Expected on ice. Else check the wheel topics and the heading.",
+        "None is needed on ice. On other ground check the wheel topics and the heading.",
     ),
     "windows_contradict": Explanation(
         "grave",

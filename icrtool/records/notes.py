@@ -58,7 +58,7 @@ def note(code: str, text: str, subject: str = "") -> Note:
     KeyError
         The code is not in the catalogue.
     """
-    # a name of a log is a `LogText`, which msgspec does not encode
+    # The name of a log is a `LogText`, which msgspec does not encode.
     return Note(code, CATALOGUE[code].grade, str.__str__(subject), str.__str__(text))
 
 

@@ -306,6 +306,6 @@ def _secrets_of(url: str) -> list[str]:
     """Return the secret parts of an address, as written, escaped and without escapes, the longest first."""
     _, known, _, behind = _parts(url)
     whole = {form for text in (known, behind) for form in (text, unquote(text), unquote_plus(text), quote(text))}
-    # a library may show pieces of the secrets
+    # A library may show pieces of the secrets.
     pieces = whole | {piece for text in whole for piece in re.split(r"[^\w.~-]+", text)}
     return sorted((piece for piece in pieces if len(piece) >= _LEAST_SECRET), key=len, reverse=True)

@@ -24,6 +24,7 @@ REST_OF_DRIVE = "the rest of the drive"
 """Value of `knows`: the row is tested on distance that its parameters were not fitted to."""
 
 WHOLE_DRIVE = "the whole drive, its trials too"
+"""Value of `knows`: the parameters of the row were fitted to the drive with its trials."""
 
 PAST = "the drive before each start"
 """Value of `knows`: the parameters of the row were learned before each trial begins."""
@@ -164,7 +165,7 @@ def kind_of(name: str) -> str:
 
 
 def row_of(name: str) -> Row:
-    """Return the row with a name: an entry, also with a gyro or heading; a calibration; a topic; a caller's model."""
+    """Return the row of a name: an entry, also with a gyro or heading; a calibration; a topic; a model of a caller."""
     row = replace(REPORT_ROWS.get(kind_of(name)) or Row(name, "given by the caller", "not known"), name=name)
     if not (by := turned_by(name)):
         return row

@@ -60,9 +60,9 @@ class MeasurementOutcome:
 
     Attributes
     ----------
-    stamp_ns : int64 (m,)
-    start_ns : stamp of the first recorded state
-    nis : (m,) normalised innovation squared, NaN where the filter did not see the measurement
+    stamp_ns : int64 (m,) stamps of the measurements [ns]
+    start_ns : stamp of the first recorded state [ns]
+    nis : (m,) normalised innovation squared; NaN where the filter did not get the measurement
     code : uint8 (m,), see `icrtool.kernels.filter_records`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
     """

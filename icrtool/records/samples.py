@@ -59,8 +59,8 @@ class WheelSamples(Samples):
 
     Attributes
     ----------
-    stamp_ns : int64 (n,), strictly increasing
-    left, right : float64 (n,), forward positive, each held over [k, k+1); [m/s], or in `unit` per second
+    stamp_ns : int64 (n,) stamps, strictly increasing [ns]
+    left, right : float64 (n,) speed of each side, forward positive, held over [k, k+1); [m/s], or in `unit` per second
     unit : ``mps``: speeds that are ready to use. Another unit: speeds as sent, in this unit per second and without the
         configured scales; `icrtool.alignment.wheel_units` converts them to m/s
     from_position : the log has positions; `left` and `right` are the mean speeds to the next sample
@@ -97,9 +97,9 @@ class PositionFixes(Samples):
 
     Attributes
     ----------
-    stamp_ns : int64 (n,), non-decreasing
-    north_m, east_m : float64 (n,)
-    var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,), NaN where not stated
+    stamp_ns : int64 (n,) stamps, non-decreasing [ns]
+    north_m, east_m : float64 (n,) position in the local plane [m]
+    var_north_m2, var_east_m2, cov_north_east_m2 : float64 (n,) variances and covariance [m^2]; NaN where not stated
     stated_class : uint8 (n,), NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX or RTK_FIX; None where no message
         states a kind of fix
     """
@@ -119,9 +119,9 @@ class HeadingSamples(Samples):
 
     Attributes
     ----------
-    stamp_ns : int64 (n,), non-decreasing
-    heading_rad : float64 (n,), in (-pi, pi]
-    var_rad2 : float64 (n,), NaN where not stated
+    stamp_ns : int64 (n,) stamps, non-decreasing [ns]
+    heading_rad : float64 (n,) heading, in (-pi, pi] [rad]
+    var_rad2 : float64 (n,) variance of the heading [rad^2]; NaN where not stated
     """
 
     stamp_ns: Ints
@@ -130,6 +130,7 @@ class HeadingSamples(Samples):
 
 
 NO_HEADINGS = HeadingSamples(np.empty(0, np.int64), np.empty(0), np.empty(0))
+"""Headings of a log without a heading: no row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,9 +139,9 @@ class GyroSamples(Samples):
 
     Attributes
     ----------
-    topic : where they were read
-    stamp_ns : int64 (n,), strictly increasing
-    rate_radps : float64 (n,)
+    topic : topic of the turn rates
+    stamp_ns : int64 (n,) stamps, strictly increasing [ns]
+    rate_radps : float64 (n,) turn rate [rad/s]
     """
 
     topic: str
@@ -154,9 +155,9 @@ class GyroAxes(Samples):
 
     Attributes
     ----------
-    topic : where they were read
-    stamp_ns : int64 (n,), strictly increasing
-    rates_radps : float64 (n, 3), about x, y, z of the sensor
+    topic : topic of the turn rates
+    stamp_ns : int64 (n,) stamps, strictly increasing [ns]
+    rates_radps : float64 (n, 3) turn rates about x, y, z of the sensor [rad/s]
     """
 
     topic: str
@@ -264,8 +265,9 @@ class InputFile:
 
     Attributes
     ----------
-    path : as given, without a password or token
-    sha256 : hex; None where not all of it was read
+    path : path or address as it was given, without a password or token
+    bytes : size of the file
+    sha256 : SHA-256 of the content in hexadecimal digits; None where not all of the file was read
     etag, version : tags of the content by an object store or a web server
     address : SHA-256 of the whole address, with the password and token that `path` leaves out
     """
@@ -295,17 +297,17 @@ class SensorColumns:
 
     Attributes
     ----------
-    wheel_stamp_ns : int64 (n,)
-    wheel_position_left_m, wheel_position_right_m : float64 (n,), travel of each side since an arbitrary start
-    wheel_v_left_mps, wheel_v_right_mps : float64 (n,), forward positive
-    gnss_stamp_ns : int64 (m,)
-    latitude_deg, longitude_deg : float64 (m,), WGS 84
-    height_m : float64 (m,), above the ellipsoid
-    gnss_std_m : float64 (m,), of north and of east; NaN writes a fix whose covariance is unknown
-    gnss_status : int64 (m,), NavSatStatus: -1 none, 0 fix, 1 SBAS, 2 GBAS (RTK)
-    heading_stamp_ns : int64 (k,)
-    heading_rad : float64 (k,), clockwise from north
-    yaw_rate_radps : float64 (k,), clockwise positive
+    wheel_stamp_ns : int64 (n,) stamps of the wheels [ns]
+    wheel_position_left_m, wheel_position_right_m : float64 (n,) travel of each side since an arbitrary start [m]
+    wheel_v_left_mps, wheel_v_right_mps : float64 (n,) speed of each side, forward positive [m/s]
+    gnss_stamp_ns : int64 (m,) stamps of the fixes [ns]
+    latitude_deg, longitude_deg : float64 (m,) position, WGS 84 [deg]
+    height_m : float64 (m,) height above the ellipsoid [m]
+    gnss_std_m : float64 (m,) standard deviation of north and of east [m]; NaN writes a fix with unknown covariance
+    gnss_status : int64 (m,) status of NavSatStatus: -1 none, 0 fix, 1 SBAS, 2 GBAS (RTK)
+    heading_stamp_ns : int64 (k,) stamps of heading and turn rate [ns]
+    heading_rad : float64 (k,) heading, clockwise from north [rad]
+    yaw_rate_radps : float64 (k,) turn rate, clockwise positive [rad/s]
 
     Notes
     -----

@@ -77,9 +77,10 @@ class RobotLog:
 
     Attributes
     ----------
-    datum : None where the position reference was metric already (total station, lidar, motion capture)
+    datum : origin of the local plane; None where the position reference is metric (total station, lidar, motion
+        capture)
     rejected_fixes : number of fixes dropped while reading, by reason (``no fix``, ``not finite`` ...)
-    notes : findings, in the order they were made; `warnings` : their sentences
+    notes : findings, in the order they were made
     antenna_m : position of the antenna from the body origin by the transforms in the log, forward and right [m]; None
         without such a transform
     gyro : turn rates of an inertial unit, None without an inertial unit; the filter does not use them

@@ -131,7 +131,8 @@ def _answering_store(kind: Any, settings: tuple[tuple[str, Any], ...], bucket: s
     files, err = answers[0]
     if err is not None and (files is None or isinstance(err, _classes(_UNREACHED))):
         raise err
-    return files  # a host that refuses to describe its bucket may give a file
+    # A host that refuses to describe its bucket may still give a file.
+    return files
 
 
 def _timeout_settings(scheme: str) -> dict[str, Any]:
