@@ -44,7 +44,7 @@ OF_FILES: dict[str, Explanation] = {
     "log_more_problems": Explanation(
         "warning",
         "More than 20 problems were found while a file was read.",
-        "Only the first 20 are listed; the others were handled in the same way.",
+        "Only the first 20 are listed; the others were handled as the first ones.",
         "Copy the log again from where it was recorded.",
     ),
     "messages_unreadable": Explanation(
