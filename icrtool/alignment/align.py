@@ -282,6 +282,7 @@ class Agreement(NamedTuple):
 
 
 NONE = Agreement(math.inf, 0.0)
+"""Agreement of streams that cannot be compared."""
 
 
 def choose_reference(log: RobotLog, config: Config) -> RobotLog:

@@ -65,6 +65,7 @@ class Shifts(NamedTuple):
 
 
 NO_SHIFTS = Shifts(0.0, 0.0, ())
+"""Shifts of a log whose streams have one clock."""
 
 
 def with_configured_delays(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts]:

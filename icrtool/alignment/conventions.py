@@ -56,6 +56,8 @@ FAULTS = {"swapped": 1.0, "one side reversed": 1.0, "both reversed": 1.0, "headi
 common fault; two joints or topics with exchanged names are rarer."""
 
 ABOUT_RAD = math.radians(135.0)
+"""Smallest offset of a heading that counts as turned about [rad]."""
+
 BACKWARDS_SHARE = 0.8
 """Share of the distance driven backwards above which a hypothesis has a fault. Robots are mostly driven forward."""
 
@@ -118,6 +120,7 @@ class Decision(NamedTuple):
 
 
 AS_NAMED = Convention(swapped=False, sign_left=1, sign_right=1, heading=1, position=1)
+"""The convention in which sides, signs and senses are as their names state."""
 
 
 class _Shown(NamedTuple):

@@ -76,6 +76,7 @@ class Delay(NamedTuple):
 
 
 UNKNOWN = Delay(math.nan, math.nan)
+"""A delay that was not measured."""
 
 
 class StreamDelays(NamedTuple):
@@ -172,14 +173,16 @@ def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bo
     together : as in `StreamDelays`
     """
     subjects = [("the heading", "lags", "frames.heading_delay_s"), ("the position", "lags", "frames.reference_delay_s")]
-    alike = not together and applied[0] == applied[1] and free[0]
+    are_equal = not together and applied[0] == applied[1] and free[0]
     also = (
-        "; the position is corrected by the same delay, because no difference of both delays is shown" if alike else ""
+        "; the position is corrected by the same delay, because no difference of both delays is shown"
+        if are_equal
+        else ""
     )
     if together:
         subjects[1] = ("the position and its heading", "lag", "frames.reference_delay_s")
     notes = list[Note]()
-    for row in [1] if together else [0] if alike else [0, 1]:
+    for row in [1] if together else [0] if are_equal else [0, 1]:
         (subject, lags, key), value = subjects[row], applied[row]
         if value != 0.0 and free[row]:
             fact = f"{subject} {lags} the wheels" if value > 0 else f"the wheels lag {subject}"

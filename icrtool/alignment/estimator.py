@@ -43,6 +43,8 @@ ESTIMATE_NAMES = (
     "heading_delay",
     "drag",
 )
+"""Names of the parameters, in the order of their rows."""
+
 (
     WHEEL_SCALE, ICR_MIDDLE, SIDEWAYS, SIDE_SLIP, TURN_GAIN, SIDE_ASYMMETRY, HEADING_DRIFT, HEADING_OFFSET,
     POSITION_LAG, HEADING_LAG, TURN_DRAG,
@@ -50,6 +52,8 @@ ESTIMATE_NAMES = (
 """Rows of the parameters: a, m, c, l, k, q, g, d, tau_p, tau_h and n of the equations above."""
 
 ESTIMATE_PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""Prior means, in the order of `ESTIMATE_NAMES`."""
+
 ESTIMATE_PRIOR_STD = np.array([0.5, 0.1, 0.5, 0.2, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5, 0.1])
 """Prior standard deviations, in the order of `ESTIMATE_NAMES`. They have an effect only where a drive does not separate
 parameters.
@@ -108,6 +112,7 @@ MOUNTING_STD_RAD = math.radians(3.0)
 """Standard deviation of a sensor's direction from straight ahead, where no drive shows its offset [rad]."""
 
 MOST_NEWTON_STEPS = 15
+"""Largest number of Newton steps of a fit."""
 
 EVIDENCE_SIGMAS = 4.0
 """Number of standard deviations needed against an assumption: sensors mounted straight, equal sides, measured wheels.

@@ -30,6 +30,8 @@ from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX,
 from icrtool.records.tables import RobotLog
 
 REFERENCE = 0
+"""Class of the fixes of a metric reference."""
+
 CLASSES = {REFERENCE: "reference", OTHER_FIX: "other", FLOAT_FIX: "float", FIXED_FIX: "fixed"}
 """Classes by name. A metric pose (lidar, total station, motion capture) is a reference, and has one class."""
 
@@ -134,10 +136,10 @@ def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
     """
     least = np.select([kinds == code for code in CLASS_STD_M], list(CLASS_STD_M.values()), 0.0)[:, None]
     interval = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else 0.0
-    alike = max(1.0, 2.0 * CORRELATION_S / interval) if interval > 0 else 1.0
+    group_size = max(1.0, 2.0 * CORRELATION_S / interval) if interval > 0 else 1.0
     own_variance = np.maximum(np.where(np.isfinite(variance), variance, 0.0), least**2)
     # Above the largest accepted value the filter would treat the variance as unknown and the fix as a good one.
-    grown: Floats = np.minimum(alike * own_variance, (LARGEST_SANE_GNSS_STD_M / 2) ** 2)
+    grown: Floats = np.minimum(group_size * own_variance, (LARGEST_SANE_GNSS_STD_M / 2) ** 2)
     return grown
 
 
@@ -198,14 +200,16 @@ STRETCH_VARIANCE = 9.0
 fixed. The usual variance is measured while the robot moves, since jitter of the stamps then adds noise."""
 
 STRETCHES_PER_SIDE = 5
+"""Number of stretches before a jump, and number of stretches after it, that are compared."""
+
 SIDES_VARIANCE = 1.7
-"""Number of stretches before and after a jump that are compared, and the ratio of their variances. The noisier side is
-float if the ratio is larger."""
+"""Ratio of the variances before and after a jump above which the noisier side is float."""
 
 LONGEST_EXCURSION_S = 60.0
+"""Longest time between two jumps that cancel each other [s]. The fixes between two such jumps are wrong."""
+
 TAKEN_BACK = 0.25
-"""Longest time between two jumps that cancel each other [s], and largest share of the first jump that then remains. The
-fixes between two such jumps are wrong."""
+"""Largest share of the first jump that remains after two jumps that cancel each other."""
 
 MOST_RTK_JUMPS = 500
 """Largest number of jumps of a receiver that sometimes loses RTK. With more, the reference has another kind of

@@ -130,6 +130,8 @@ SMALLEST_OFFSET_RAD = math.radians(1.0)
 """Smallest offset of a heading that is significant [rad]."""
 
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
+"""Words of findings about a heading of the other convention."""
+
 OTHER_CONVENTION = note(
     "heading_convention_contradicts", f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned"
 )
@@ -184,6 +186,7 @@ class CourseComparison(NamedTuple):
 
 
 NOT_COMPARED = CourseComparison(0, math.nan, math.nan, False, 0.0)
+"""Comparison of a drive without windows."""
 
 
 def compare_with_course(windows: DriveWindows) -> CourseComparison:

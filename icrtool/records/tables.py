@@ -254,6 +254,7 @@ def _stamped(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str)
 
 
 def _wheels(frame: pd.DataFrame, name: str) -> tuple[WheelSamples, tuple[str, ...]]:
+    """Return the wheel samples of a table, in the unit of its columns, and the names of these columns."""
     columns = _chosen(frame, tuple(WHEEL_COLUMN_UNITS), "wheels", name)
     unit, is_position = WHEEL_COLUMN_UNITS[columns]
     stamps, (left, right) = _rows(frame, columns, "wheels", name)
@@ -265,6 +266,13 @@ def _wheels(frame: pd.DataFrame, name: str) -> tuple[WheelSamples, tuple[str, ..
 
 
 def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | None, tuple[str, ...]]:
+    """Return the positions of a table, the origin of their local plane, and the names of the columns.
+
+    Raises
+    ------
+    DataError
+        A latitude or longitude that is no angle in degrees.
+    """
     columns = _chosen(frame, POSITION, "position", name)
     has_std = any(column in frame for pair in POSITION_STD for column in pair)
     stds = _chosen(frame, POSITION_STD, "position", name) if has_std else ()
@@ -298,6 +306,7 @@ def _at(frame: pd.DataFrame, column: str, group: Sequence[str], stamps: Ints, na
 
 
 def _heading(frame: pd.DataFrame, name: str) -> tuple[HeadingSamples, tuple[str, ...]]:
+    """Return the headings of a table, clockwise from north, and the names of the columns."""
     columns = _chosen(frame, HEADING_COLUMNS, "heading", name)
     stamps, (angle,) = _rows(frame, columns, "heading", name)
     angle = np.radians(angle) if columns[0].endswith("_deg") else angle
@@ -371,8 +380,8 @@ class States:
         for name in (field.name for field in fields(self)):
             possible = np.abs(getattr(self, name)) < LARGEST_STATE
             if name != "stamp_ns" and not possible.all():
-                what = f"{name} that is not a finite number below {LARGEST_STATE:g}"
-                return f"row {possible.argmin()} of its states has {what}"
+                fault = f"{name} that is not a finite number below {LARGEST_STATE:g}"
+                return f"row {possible.argmin()} of its states has {fault}"
         return ""
 
     def __len__(self) -> int:

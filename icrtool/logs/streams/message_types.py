@@ -1,4 +1,7 @@
-"""Table of all message types that are read: for each role a row with fields, units, validity and worth of the type."""
+"""Table of all message types that are read: for each role a row with fields, units, validity and score of the type.
+
+The attribute ``worth`` of a row is the score: the topic with the highest score is chosen first.
+"""
 
 from __future__ import annotations
 
