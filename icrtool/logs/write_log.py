@@ -81,6 +81,8 @@ HEIGHT_STD_RATIO = 2.0
 """Ratio of vertical to horizontal GNSS noise, a usual value for the geometry of the satellites."""
 
 JACKAL_TYPES = ("jackal_msgs/msg/DriveFeedback", "jackal_msgs/msg/Feedback")
+"""Message types of the wheels of a Clearpath Jackal: of one driver, and of all drivers."""
+
 ROS1_JACKAL_FEEDBACK = (
     "std_msgs/Header header\njackal_msgs/DriveFeedback[2] drivers\nfloat32 pcb_temperature\n"
     "float32 mcu_temperature\nint8 commanded_mode\nint8 actual_mode\n"

@@ -37,6 +37,7 @@ do not fit into 64 bits."""
 
 
 Times = TypeVar("Times", int, Ints)
+"""One log time, or log times (n,) [ns]."""
 
 
 def folded_ns(time_ns: Times) -> Times:
@@ -135,6 +136,7 @@ class Cut(NamedTuple):
 
 
 WHOLE = Cut()
+"""A cut that keeps all messages."""
 
 
 def work_ahead(

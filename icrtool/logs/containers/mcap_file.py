@@ -34,7 +34,11 @@ if TYPE_CHECKING:
     from mcap.records import Schema, Statistics
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of an MCAP file."""
+
 MCAP_PIECE_BYTES = 1 << 22
+"""Number of bytes of a file without index that are read at a time."""
+
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 _FOOTER, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 7, 8, 11, 15
 """Operation codes of records."""

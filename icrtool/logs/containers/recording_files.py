@@ -28,6 +28,7 @@ _PACKED_END = re.compile(rf"{PACKED_SUFFIX}$", re.IGNORECASE)
 _ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
 
 STORAGE = re.compile(rf"\.(mcap|db3)(?:{PACKED_SUFFIX})?$")
+"""Pattern of the end of the name of a storage file of a ROS 2 bag."""
 
 LARGEST_METADATA_BYTES = 1 << 18
 """Largest size of metadata.yaml [bytes]. The file of a bag of 200 topics has about 100,000 bytes."""

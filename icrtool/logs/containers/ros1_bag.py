@@ -28,6 +28,8 @@ from icrtool.logs.containers.container import LARGEST_DESCRIPTIONS_BYTES, Channe
 from icrtool.records.text import LogText
 
 BAG_MAGIC = b"#ROSBAG V2.0\n"
+"""First bytes of a ROS 1 bag."""
+
 _BAG_MESSAGE, _BAG_HEADER, _INDEX_DATA, _BAG_CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 """Operation codes of records."""
 

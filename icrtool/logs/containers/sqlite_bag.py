@@ -30,6 +30,8 @@ from icrtool.logs.containers.container import (
 from icrtool.records.text import LogText
 
 SQLITE_MAGIC = b"SQLite format 3\0"
+"""First bytes of a SQLite file."""
+
 _WAL_AT = 18
 """Offset of the byte of a database that states whether it uses a write-ahead log."""
 

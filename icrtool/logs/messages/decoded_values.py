@@ -200,6 +200,7 @@ def _padded(rows: Sequence[Sequence[Any]], fill: float, dtype: type[np.float64 |
 
 
 NMEA_SENTENCE = "nmea_msgs/Sentence"
+"""Message type that holds sentences of NMEA 0183."""
 
 GGA, RMC, GST, HDT = 1, 2, 4, 8
 """Kinds of sentences that are read. GGA: a fix with its quality. RMC: a fix with its validity. GST: standard deviations

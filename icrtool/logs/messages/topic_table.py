@@ -118,8 +118,11 @@ class BackwardStep(NamedTuple):
 
 
 NO_BACKWARD_STEP = BackwardStep(0, 0.0)
+"""Log times that do not go back."""
 
 FRAME_FIELD = "header.frame_id"
+"""Field with the name of the coordinate frame of a message."""
+
 STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
 """Fields of the stamp of a message: in its header, and in a message without a header."""
 
@@ -305,6 +308,8 @@ def find_backward_step(times: Ints) -> BackwardStep:
 
 
 DYNAMIC_JOINT_STATE = "control_msgs/DynamicJointState"
+"""Message type that states the values of each joint by name of an interface."""
+
 _NAMES, _INTERFACES, _VALUES = "joint_names[*]", "interface_values[*].interface_names", "interface_values[*].values"
 
 

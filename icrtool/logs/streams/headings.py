@@ -91,6 +91,7 @@ class Bearing:
 _NORTHS = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
 _AZIMUTH = Bearing("azimuth", 95.0, known_by="stated in the message")
 AZIMUTH_FIELDS = ("azimuth", "variance", "unit", "orientation", "reference")
+"""Fields of an azimuth message."""
 
 
 def read_azimuths(table: TopicTable, _: Config) -> HeadingSource:
@@ -133,6 +134,8 @@ def read_baselines(table: TopicTable, _: Config) -> HeadingSource:
 
 
 INS_WORDS = re.compile(r"\bins\b|vectornav|novatel|sbg|microstrain|xsens|gnss|gps|global|map|filtered", re.IGNORECASE)
+"""Words in names of topics with the orientation of an inertial navigation system."""
+
 _RAW_WORDS = re.compile(r"raw", re.IGNORECASE)
 _ATTITUDE_WORDS = re.compile(r"quaternion|filter|imu|attitude|orientation|ahrs|xsens|mti", re.IGNORECASE)
 """Words in names of topics of QuaternionStamped that hold the orientation of an inertial unit. Other topics of this
@@ -333,7 +336,10 @@ def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:
 
 
 GYRO_TYPE = "sensor_msgs/Imu"
+"""Message type of the turn rates of an inertial unit."""
+
 GYRO_AXES = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
+"""Fields of the turn rates about the axes of an inertial unit [rad/s]."""
 
 
 def find_gyro(

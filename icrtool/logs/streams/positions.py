@@ -84,6 +84,7 @@ GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.I
 """Words in names of topics that hold goals or commands."""
 
 GOAL_PROBLEM = "its name is the name of a goal, not of a measurement"
+"""Reason for which the topic of a goal is no position."""
 
 LEAST_DRIVE_WIDTH_M = 1.0
 """Smallest width of a drive with which the plane of the drive is found, as a standard deviation of positions [m]."""
@@ -104,6 +105,7 @@ LARGEST_RADIUS_M = 6.40e6
 """Largest distance of a place on earth from the centre of the earth [m]."""
 
 NO_SOLUTION = Solution("", {})
+"""Solution of a message type without a field that states it."""
 
 HIGHEST_M = 20_000.0
 """Largest height that is used [m]. A larger height stands for "unknown", and is replaced by the median of the other
@@ -302,7 +304,11 @@ def _is_level(places_m: Floats) -> bool:
 
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+"""Message types of transforms between frames."""
+
 BASE_FRAMES = ("base_link", "base_footprint", "chassis_link", "base")
+"""Names of the frame of the body, the most usual name first."""
+
 LARGEST_LEVER_ARM_M = 5.0
 """Largest distance of an antenna from the body origin [m]. A longer transform is ignored."""
 
@@ -319,6 +325,8 @@ TRANSFORM_FIELDS = (
 """Fields of a transform: name of the parent frame, name of the child frame, translation [m], rotation."""
 
 TRANSFORM_STAMP = tuple(f"{_PREFIX}header.stamp.{part}" for part in ("sec", "nanosec"))
+"""Fields of the stamp of a transform."""
+
 _POSE = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw"))
 
 Transforms = dict[str, tuple[str, Floats, Floats]]

@@ -384,6 +384,7 @@ def _list_topics(channels: Sequence[Channel], reasons: Mapping[str, str]) -> lis
 
 
 JOINT_KEYS = ("left_joints", "right_joints")
+"""Keys of the configuration that name the joints of each side."""
 
 
 def check_joints(chosen: WheelSource | None, candidates: Sequence[WheelSource], config: Config) -> None:

@@ -60,6 +60,7 @@ class ClockSet(NamedTuple):
 
 
 NEVER_SET = ClockSet(0, back=False, before_ns=0)
+"""A clock that was not set during the log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,6 +246,7 @@ NEVER_MOVES_PENALTY = 60.0
 """Number that is subtracted from the score of a topic that never moves, so that a topic that moves is preferred."""
 
 NO_ROWS: Bools = np.zeros(0, np.bool_)
+"""Mask of a table without rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -180,6 +180,7 @@ TICK_FIELDS = (
     "valid_wheels",
     *(f"wheel_{field}_{place}" for field in ("ticks", "direction") for place in ("fl", "fr", "rl", "rr")),
 )
+"""Fields of xbot_msgs/WheelTick: factor, mask of the wheels, and ticks and direction of each wheel."""
 
 
 def read_ticks(table: TopicTable, _: Config) -> WheelSource:
@@ -216,12 +217,16 @@ def read_ticks(table: TopicTable, _: Config) -> WheelSource:
 
 
 COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.IGNORECASE)
+"""Words in names of topics that hold commanded speeds."""
+
 COMMAND_NOTES = (
     note(
         "wheels_commanded",
         "these are commanded speeds, not measured ones: their difference from the wheel speeds is in ICRs and delays",
     ),
 )
+"""Findings about wheels whose speeds are commands."""
+
 COMMANDED_PENALTY = 40.0
 """Number that is subtracted from the score of a topic with commanded speeds."""
 
@@ -291,6 +296,8 @@ class Twist:
 
 
 ODOMETRY_POSE_PATH = "pose.pose."
+"""Beginning of the fields of the pose in an odometry message."""
+
 ODOMETRY_POSE = tuple(
     f"{ODOMETRY_POSE_PATH}{field}"
     for field in ("position.x", "position.y", *(f"orientation.{axis}" for axis in "xyzw"))
@@ -363,6 +370,8 @@ def pose_travel(x: Floats, y: Floats, qx: Floats, qy: Floats, qz: Floats, qw: Fl
 
 
 WHEEL_WORDS = re.compile(r"wheel|track(?!er|ing)|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
+"""Words in names of joints that are wheels."""
+
 _OTHER_JOINTS = re.compile(
     r"(arm|pan|tilt|lift)\d*|(gripper|flipper|finger|steer|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension).*"
 )
