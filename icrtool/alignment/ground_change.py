@@ -125,6 +125,26 @@ def find_changes(fit: AlignmentFit) -> GroundChanges | None:
     return None
 
 
+def find_exchange(fit: AlignmentFit) -> float | None:
+    """Return the time from which on the sides of the wheels are exchanged, or no longer exchanged [s]; None if never.
+
+    Before and after this time the wheels turn with the robot and against it, each by `CHANGE_SIGMAS`.
+    """
+    turns = _turns(fit)
+    if turns is None or not np.any(turns.x):
+        return None
+    places = np.unique(np.linspace(0, len(turns.x), CHANGE_CANDIDATES + 2).astype(np.int64))
+    ways, _ = _best_partitions(turns, places)
+    if len(ways) < 2:
+        return None
+    rows = _refined(turns, ways[1], places)
+    before, after = (_ratio(turns.rows(first, stop)) for first, stop in pairwise(rows))
+    if before is None or after is None or before[0] * after[0] >= 0.0:
+        return None
+    are_shown = all(abs(ratio) > CHANGE_SIGMAS * std for ratio, std in (before, after))
+    return float(turns.begin[rows[1]]) if are_shown else None
+
+
 def _turns(fit: AlignmentFit) -> _Turns | None:
     """Return turns of wheels and heading; None with too few windows."""
     track, delay = fit.windows.track, fit.estimate("heading_delay")[0]

@@ -15,10 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit, residuals_by_estimate
-from icrtool.alignment.ground_change import find_changes
+from icrtool.alignment.ground_change import find_changes, find_exchange
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken_intervals
 from icrtool.alignment.sparse_reference import spans_of_measured
+from icrtool.alignment.wheel_limits import find_clock_rate, find_limit
 from icrtool.alignment.wheel_units import Scale, radius_hint, wrong_size
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Ints, rows_at_steps, unwrapped
@@ -189,8 +190,12 @@ def align_wheels(
     """
     wheels, notes, applied = log.wheels, list[Note](), (1.0, 1.0)
     change = None if fit is None or not sound else find_changes(fit)
-    filtered = "" if fit is None or not sound or change is not None else find_filtering(fit)
-    if fit is not None and not filtered:
+    exchanged_s = None if fit is None or not sound or change is not None else find_exchange(fit)
+    rate = None if fit is None or not sound or exchanged_s is not None else find_clock_rate(fit)
+    limit = None if fit is None or not sound or exchanged_s is not None else find_limit(wheels, fit)
+    has_cause = any(one is not None for one in (change, exchanged_s, rate, limit))
+    filtered = "" if fit is None or not sound or has_cause else find_filtering(fit)
+    if fit is not None and not filtered and exchanged_s is None:
         applied, notes = _find_scales(fit, config, log, sound=sound)
     moving = (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))[1:] > 0
     same = (np.diff(wheels.v_left_mps) == 0) & (np.diff(wheels.v_right_mps) == 0)
@@ -217,8 +222,16 @@ def align_wheels(
         turn_unexplained_std=finite_or_none(turn_unexplained_std),
         ground_change_s=None if change is None else change.times_s[0],
         ground_stretches=() if change is None else change.stretches,
+        exchanged_s=exchanged_s,
+        clock_rate=None if rate is None else rate.value,
+        clock_rate_std=None if rate is None else rate.std,
+        limit_mps=None if limit is None else limit.speed_mps,
     )
     notes += [] if change is None else [note("ground_changed", change.text)]
+    notes += (
+        [] if rate is None else [note("wheel_clock_differs", rate.sentence(float(np.ptp(log.wheels.stamp_ns)) / 1e9))]
+    )
+    notes += [] if limit is None else [note("wheels_limited", limit.text)]
     return facts, applied, [*notes, *_fused_note(log, config.wheels.twist_width_m or config.robot.track_width_m)]
 
 

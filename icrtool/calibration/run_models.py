@@ -97,9 +97,11 @@ def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocumen
     """
     if not document.usable:
         return document
-    changed = next((finding.text for finding in document.notes if finding.code == "ground_changed"), "")
-    if changed and not document.request.changes_s:
+    texts = {finding.code: finding.text for finding in document.notes}
+    if (changed := texts.get("ground_changed")) and not document.request.changes_s:
         return msgspec.structs.replace(document, partly_because=changed)
+    if limited := texts.get("wheels_limited"):
+        return msgspec.structs.replace(document, partly_because=limited)
     hidden = [ICR_WORDS[name] for name in ICR_COLUMNS if document.icr_of_drive(name) is None]
     has_width = document.config.robot.track_width_m is not None
     if has_width and document.controller is None:

@@ -94,9 +94,8 @@ def unusable_reasons(
     wheels : facts about the wheels; without compared turns, the filter's noise of the heading decides
     inverted : the right ICR ended left of the left ICR
     """
-    if filtered:
-        needed = "wheel speeds are needed: topics.wheels names their topic"
-        return [note("wheels_filtered", f"filtered or fused odometry ({filtered}); {needed}")]
+    if (cause := _cause_of_all(filtered, wheels)) is not None:
+        return [cause]
     hidden = [ICR_WORDS[name] for name in excitation.verdict.not_shown]
     why = "it turns too little, or its sensors disagree"
     reasons = list[Note]()
@@ -122,6 +121,18 @@ def unusable_reasons(
     if twist_separation is not None and not hidden:
         reasons += _twist_reasons(*twist_separation)
     return reasons
+
+
+def _cause_of_all(filtered: str, wheels: WheelFacts | None) -> Note | None:
+    """Return the finding that is the only reason, because it causes all others; None without it."""
+    if filtered:
+        needed = "wheel speeds are needed: topics.wheels names their topic"
+        return note("wheels_filtered", f"filtered or fused odometry ({filtered}); {needed}")
+    if wheels is None or wheels.exchanged_s is None:
+        return None
+    at = f"{wheels.exchanged_s:.0f}"
+    parts = f"fit each part by itself: --to {at}, --from {at}"
+    return note("sides_exchanged", f"left and right wheels are exchanged before or after about {at} s; {parts}")
 
 
 def _why_turns_unexplained(wheels: WheelFacts | None) -> str:

@@ -163,6 +163,18 @@ OF_WHEELS: dict[str, Explanation] = {
         "ICRs and multiplier of the whole drive lie between the values of its stretches.",
         "Fit with `--terrain-change T`, or each stretch by itself with `--from` and `--to`.",
     ),
+    "wheel_clock_differs": Explanation(
+        "warning",
+        "The delay between wheels and headings grows during the drive: their clocks have different rates.",
+        "Wheels and headings are compared at times that differ by a part of a second or more.",
+        "Put both on one clock; `topics.clock=log` takes log times.",
+    ),
+    "wheels_limited": Explanation(
+        "warning",
+        "The wheel speeds end at a largest value that they hold, and the robot moves more there than elsewhere.",
+        "ICRs and multiplier are those of speeds that were cut off.",
+        "Record the speeds before they are cut off, or drive more slowly.",
+    ),
     "wheels_from_pose": Explanation(
         "warning",
         "The twist of an odometry stays 0 while its pose moves.",

@@ -216,6 +216,11 @@ class WheelFacts(Record, frozen=True, kw_only=True):
         not explain, 1 - R^2, and its standard deviation; None without windows
     ground_change_s : time of the first change of ground since the first wheel sample [s]; None without a change
     ground_stretches : the stretches between changes of ground; empty without a change
+    exchanged_s : time since the first wheel sample from which on, or until which, the sides are exchanged [s]; None if
+        they never are
+    clock_rate, clock_rate_std : rate of the wheels' clock against that of the headings, minus 1, and its standard
+        deviation; None where they do not differ
+    limit_mps : largest speed that the wheels report although the robot goes faster [m/s]; None without such a limit
     """
 
     scale: float | None
@@ -232,6 +237,10 @@ class WheelFacts(Record, frozen=True, kw_only=True):
     turn_unexplained_std: float | None = None
     ground_change_s: float | None = None
     ground_stretches: tuple[GroundStretch, ...] = ()
+    exchanged_s: float | None = None
+    clock_rate: float | None = None
+    clock_rate_std: float | None = None
+    limit_mps: float | None = None
 
 
 class HeadingFacts(Record, frozen=True, kw_only=True):

@@ -97,6 +97,12 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
         "The ICRs describe the filter that made the speeds, not the robot.",
         "Name the topic of the wheels themselves with `topics.wheels`.",
     ),
+    "sides_exchanged": Explanation(
+        "grave",
+        "The wheels turn with the robot in one part of the drive and against it in the other.",
+        "Left and right are exchanged in one of the parts: no ICRs fit both.",
+        "Fit each part by itself with `--from` and `--to`; check what was changed at that time.",
+    ),
     "icrs_not_shown": Explanation(
         "grave",
         "The drive does not show some ICRs: it turns too little, or its sensors disagree.",

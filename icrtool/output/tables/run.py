@@ -238,7 +238,9 @@ def _filter_check(summary: RunDocument) -> Iterator[Check]:
         sigmas = abs(at - value) / max(math.hypot(std, at_std), 1e-9)
         if sigmas > AGREES_SIGMAS:
             apart.append(f"{word} differs by {sigmas:.1f} σ: the end of the drive is not like the whole")
-    if ends:
+    if ends and unstated_grounds(summary):
+        yield Check("care", "EKF", f"ends at {', '.join(ends)}: across grounds")
+    elif ends:
         text = f"ends at {', '.join(ends)}: {'; '.join(apart) or 'agrees'}"
         yield Check("care" if apart else "good", "EKF", text)
 
