@@ -191,9 +191,9 @@ def align_wheels(
     wheels, notes, applied = log.wheels, list[Note](), (1.0, 1.0)
     change = None if fit is None or not sound else find_changes(fit)
     exchanged_s = None if fit is None or not sound or change is not None else find_exchange(fit)
-    rate = None if fit is None or not sound or exchanged_s is not None else find_clock_rate(fit)
+    clock = None if fit is None or not sound or exchanged_s is not None else find_clock_rate(fit)
     limit = None if fit is None or not sound or exchanged_s is not None else find_limit(wheels, fit)
-    has_cause = any(one is not None for one in (change, exchanged_s, rate, limit))
+    has_cause = any(one is not None for one in (change, exchanged_s, clock, limit))
     filtered = "" if fit is None or not sound or has_cause else find_filtering(fit)
     if fit is not None and not filtered and exchanged_s is None:
         applied, notes = _find_scales(fit, config, log, sound=sound)
@@ -223,14 +223,13 @@ def align_wheels(
         ground_change_s=None if change is None else change.times_s[0],
         ground_stretches=() if change is None else change.stretches,
         exchanged_s=exchanged_s,
-        clock_rate=None if rate is None else rate.value,
-        clock_rate_std=None if rate is None else rate.std,
+        clock_rate=None if clock is None else clock.value,
+        clock_rate_std=None if clock is None else clock.std,
         limit_mps=None if limit is None else limit.speed_mps,
     )
     notes += [] if change is None else [note("ground_changed", change.text)]
-    notes += (
-        [] if rate is None else [note("wheel_clock_differs", rate.sentence(float(np.ptp(log.wheels.stamp_ns)) / 1e9))]
-    )
+    duration_s = float(np.ptp(wheels.stamp_ns)) / 1e9
+    notes += [] if clock is None else [note("wheel_clock_differs", clock.sentence(duration_s))]
     notes += [] if limit is None else [note("wheels_limited", limit.text)]
     return facts, applied, [*notes, *_fused_note(log, config.wheels.twist_width_m or config.robot.track_width_m)]
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.estimator import AlignmentFit, residuals_by_estimate
-from icrtool.alignment.ground_change import CHANGE_SIGMAS
+from icrtool.alignment.estimator import ESTIMATE_PRIOR_STD, POSITION_LAG, AlignmentFit, residuals_by_estimate
+from icrtool.alignment.ground_change import CHANGE_SIGMAS, FEWEST_CHANGE_GROUPS
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.records.samples import WheelSamples
 
@@ -64,7 +64,10 @@ def find_clock_rate(fit: AlignmentFit) -> ClockRate | None:
     if np.count_nonzero(seen) < FEWEST_RATE_BLOCKS:
         return None
     times = np.array([part.mean() for part in np.array_split(begin, RATE_BLOCKS)])[seen]
-    return _rate_of(times, at[seen], std[seen])
+    rate = _rate_of(times, at[seen], std[seen])
+    # Delays of streams usually differ by that much.
+    usual_s = float(ESTIMATE_PRIOR_STD[POSITION_LAG])
+    return rate if rate is not None and abs(rate.value) * float(np.ptp(track.t)) > usual_s else None
 
 
 def _delay_of(x: Floats, y: Floats, delays: Floats) -> tuple[float, float]:
@@ -127,8 +130,8 @@ class SpeedLimit(NamedTuple):
         """The finding for the user."""
         often = f"in {100 * self.share:.0f} % of the samples"
         return (
-            f"the wheel speeds end at {self.speed_mps:.2f} m/s ({often}) while the robot goes faster, by "
-            f"{self.sigmas:.0f} σ: the ICRs are those of speeds that were cut off"
+            f"the wheels report their largest speed {often} while the robot goes faster, by {self.sigmas:.0f} σ: "
+            f"the ICRs are those of speeds that were cut off"
         )
 
 
@@ -139,7 +142,8 @@ LIMIT_CHANCE = 1e-6
 """Largest probability that values which repeat as often as elsewhere have the longest run of the largest speed."""
 
 AT_LIMIT_SHARE = 0.2
-"""Share of the time of a window from which on the window counts as at the limit."""
+"""Smallest share of the time of a window with which the window counts as at the limit. Where most windows have more,
+the half with the larger shares counts."""
 
 
 def find_limit(wheels: WheelSamples, fit: AlignmentFit) -> SpeedLimit | None:
@@ -157,12 +161,12 @@ def find_limit(wheels: WheelSamples, fit: AlignmentFit) -> SpeedLimit | None:
         within = np.interp(end, seconds, until) - np.interp(begin, seconds, until)
         return np.asarray(within / np.maximum(end - begin, 1e-9))
 
-    residuals, forward = residuals_by_estimate(fit), np.sign(windows.over(track.at_places(track.mean_speed)))
+    residuals, laid = residuals_by_estimate(fit), windows.over(track.at_places(track.mean_speed))
+    # Slip in turns makes a robot go less far than its wheels, not further.
     of_places = share(track.place_t[windows.begin], track.place_t[windows.end])
-    further = _difference(-residuals.after[0] * forward, of_places, windows.group)
-    of_turns = share(windows.turn_begin, windows.turn_end)
-    turning = np.sign(residuals.turn_rad)
-    more = _difference(-residuals.turn_after * turning, of_turns, windows.turn_group)
+    further = _difference(laid, laid - residuals.before[0], of_places, windows.group)
+    predicted = residuals.turn_after + residuals.turn_rad
+    more = _difference(predicted, residuals.turn_rad, share(windows.turn_begin, windows.turn_end), windows.turn_group)
     sigmas = max(further, more)
     if sigmas < CHANGE_SIGMAS:
         return None
@@ -190,20 +194,29 @@ def _samples_at_limit(speed: Floats) -> Bools | None:
     return np.asarray(at_top) if is_limit else None
 
 
-def _difference(residual: Floats, share: Floats, group: Ints) -> float:
-    """Return by how many standard deviations residuals (n,) are larger at the limit than elsewhere; 0 if unknown.
+def _difference(predicted: Floats, seen: Floats, share: Floats, group: Ints) -> float:
+    """Return by how many standard deviations the ratio of seen to predicted is larger at the limit than elsewhere.
 
     Parameters
     ----------
+    predicted, seen : (n,) motion in windows
     share : (n,) of the time at the limit
     group : (n,) numbers of stretches that are independent of one another
+
+    Returns
+    -------
+    float
+        0 with too few stretches.
     """
-    means, variance = list[float](), 0.0
-    for part in (share >= AT_LIMIT_SHARE, share <= 0.0):
+    ratios, variance = list[float](), 0.0
+    often = share >= max(AT_LIMIT_SHARE, float(np.median(share)))
+    for part in (often, ~often):
+        x, y = predicted[part], seen[part]
         groups, row = np.unique(group[part], return_inverse=True)
-        if len(groups) < 4:
+        square = float(x @ x)
+        if len(groups) < FEWEST_CHANGE_GROUPS or square <= 0.0:
             return 0.0
-        means.append(float(residual[part].mean()))
-        sums = np.bincount(row, residual[part] - means[-1])
-        variance += float(sums @ sums) * len(groups) / (len(groups) - 1) / np.count_nonzero(part) ** 2
-    return (means[0] - means[1]) / math.sqrt(max(variance, 1e-18))
+        ratios.append(float(x @ y) / square)
+        sums = np.bincount(row, x * (y - ratios[-1] * x))
+        variance += float(sums @ sums) * len(groups) / (len(groups) - 1) / square**2
+    return (ratios[0] - ratios[1]) / math.sqrt(max(variance, 1e-18))
