@@ -220,8 +220,8 @@ class WheelFacts(Record, frozen=True, kw_only=True):
         they never are
     clock_rate, clock_rate_std : rate of the wheels' clock against that of the headings, minus 1, and its standard
         deviation; None where they do not differ
-    limit_mps : largest speed of the wheels, which they hold although the robot goes faster, with corrected scales [m/s];
-        None without such a limit
+    limit_mps : largest speed of the wheels, which they hold although the robot goes faster, with corrected scales
+        [m/s]; None without such a limit
     """
 
     scale: float | None
