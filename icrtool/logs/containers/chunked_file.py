@@ -45,7 +45,7 @@ FIRST_SPAN_BYTES = 1 << 22
 SPAN_BYTES = 1 << 24
 """Size of each further piece of a distant file that is read [bytes]."""
 
-JOINED_BYTES = 1 << 22
+JOINED_BYTES = 1 << 23
 """Size of wanted records up to which several chunks become one block [bytes]. Fewer blocks take less time."""
 
 SMALL_PART = 0.5
