@@ -13,8 +13,9 @@ import numpy as np
 from icrtool.alignment.clock_search import NO_SHIFTS, take_shifts, with_configured_delays, with_shifts
 from icrtool.alignment.conventions import apply_convention, decide_conventions
 from icrtool.alignment.corrections import AlignedStreams, align_streams
-from icrtool.alignment.estimator import estimate_alignment
+from icrtool.alignment.estimator import ESTIMATE_PRIOR_STD, POSITION_LAG, estimate_alignment
 from icrtool.alignment.gnss_quality import grade_fixes
+from icrtool.alignment.gyro_heading import DELAY
 from icrtool.alignment.log_track import check_streams, cut_drive_windows, track_of_log
 from icrtool.alignment.sensor_noise import (
     fixes_of,
@@ -136,7 +137,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
             turn_wander_rad=None if streams.fit is None else finite_or_none(streams.fit.turn_wander_rad),
             antenna_m=antenna_m,
             antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
-            clock_std_s=streams.delays.clock_std_s,
+            clock_std_s=_clock_std_s(streams),
             heading_common_std_rad=0.0 if derived is None else derived.estimate.common_std,
             heading_sensor=log.heading_sensor,
         ),
@@ -152,6 +153,22 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
         fix_statistics=quality.statistics,
         notes=(*streams.log.notes, *streams.notes, *quality.notes),
     )
+
+
+def _clock_std_s(streams: AlignedStreams) -> float:
+    """Return the standard deviation of the time between position and heading after the correction [s].
+
+    A heading that is estimated by courses over ground has an error from a delay of the positions, so that the time
+    between both is known no better than the courses show it. At constant speed it is then known by its prior alone.
+    Where a delay was corrected that is longer than the prior's standard deviation, this prior was too narrow, and the
+    standard deviation is enlarged in proportion.
+    """
+    delays, derived = streams.delays, streams.derived
+    if derived is None or derived.source not in ("gyro_course", "wheels_course"):
+        return delays.clock_std_s
+    corrected_s = abs(delays.applied_gnss_s - delays.applied_heading_s)
+    by_windows = delays.clock_std_s * max(1.0, corrected_s / float(ESTIMATE_PRIOR_STD[POSITION_LAG]))
+    return max(by_windows, float(derived.estimate.constants_std[DELAY]))
 
 
 def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:

@@ -73,6 +73,15 @@ def test_noise_that_rare_fixes_do_not_state_is_measured(path: str) -> None:
     assert track_of_log(made.log).place_std_m == pytest.approx(0.3, rel=0.2)
 
 
+@pytest.mark.parametrize(("path", "interval_s"), [("lawnmower", 3.0), ("curved", 3.0), ("curved", 1.0)])
+def test_a_delay_at_constant_speed_is_in_the_sigma_of_x(path: str, interval_s: float) -> None:
+    """At constant speed, positions that lag have the same effect as an ICR further back."""
+    made = drive(path, interval_s, 105, seconds=SECONDS)
+    late = replace(made.log.gnss, stamp_ns=made.log.gnss.stamp_ns + 200_000_000)
+    away = away_in_sigmas(icrtool.fit(replace(made.log, gnss=late), config_of(made)), made)
+    assert all(one < 3.0 for one in away)
+
+
 def scale_of(log: RobotLog, factor: float) -> tuple[float, float]:
     wheels = log.wheels
     scale = reference_scale(wheels.stamp_ns, factor * wheels.left, factor * wheels.right, log.gnss)
