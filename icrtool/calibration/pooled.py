@@ -362,11 +362,11 @@ def calibrate(runs: Run | Sequence[Run] | Mapping[str, Sequence[Run]], *, allow_
     DataError
         No run is left, or the runs are too short.
     """
-    # A text is a sequence, too. As a single run, it is refused with a message about paths.
     if isinstance(runs, Mapping):
         grounds = [ground for ground, of_ground in runs.items() for _ in of_ground]
         every = [run for of_ground in runs.values() for run in of_ground]
         return calibrate_runs(every, allow_unusable=allow_unusable, grounds=grounds).calibration
+    # A text is a sequence, too. As a single run, it is refused with a message about paths.
     several = [runs] if isinstance(runs, (Run, str, PathLike)) else runs
     return calibrate_runs(several, allow_unusable=allow_unusable).calibration
 

@@ -23,7 +23,7 @@ from typing import Any, TextIO, cast
 
 from icrtool.records.process_resources import keep_freed, may_end, remove_unfinished
 
-__all__ = ["main", "when_used"]
+__all__ = ["lazy_imports", "main"]
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Signals that end a command. Windows has no SIGHUP."""
@@ -34,8 +34,8 @@ INTERRUPTED = 128 + signal.SIGINT
 SIGNAL_GRACE_S = 0.5
 """Time after a signal in which the main thread may end the process and the processes of a batch [s]."""
 
-OVER = 0
-"""Number in the pipe of `end_at_once` that stands for the end of the block; all others are numbers of signals."""
+END_OF_BLOCK = 0
+"""Number in the pipe of `exit_on_signals` that stands for the end of the block; all others are numbers of signals."""
 
 
 def main() -> None:
@@ -59,7 +59,7 @@ def main() -> None:
         import resource
 
         resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
-    with end_at_once(), standard_streams() as output:
+    with exit_on_signals(), standard_streams() as output:
         status = _run()
         if output.lost:
             sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
@@ -122,7 +122,7 @@ def _memory_is_limited() -> bool:
     return False
 
 
-class _Unloaded:
+class _LazyFinder:
     """Finder of the modules of icrtool. A module is loaded at the first use of a name in it, a package at once."""
 
     @staticmethod
@@ -135,22 +135,22 @@ class _Unloaded:
 
 
 @contextmanager
-def when_used() -> Iterator[None]:
+def lazy_imports() -> Iterator[None]:
     """Load the modules that the block imports (``from icrtool.output import series``) only at their first use.
 
     The help of a command then loads no numpy, pandas or pyarrow. The first use of a module must not happen in two
     threads at the same time. Packages are loaded at once, so `icrtool.output.figures`, which loads matplotlib, is
     imported in the functions that use it.
     """
-    sys.meta_path.insert(sys.meta_path.index(PathFinder), _Unloaded)
+    sys.meta_path.insert(sys.meta_path.index(PathFinder), _LazyFinder)
     try:
         yield
     finally:
-        sys.meta_path.remove(_Unloaded)
+        sys.meta_path.remove(_LazyFinder)
 
 
 @contextmanager
-def end_at_once() -> Iterator[None]:
+def exit_on_signals() -> Iterator[None]:
     """Let the signals of `ENDING` end the process, with 128 plus the number of the signal as status; not on Windows.
 
     A process gets SIGHUP when its terminal is closed.
@@ -160,12 +160,12 @@ def end_at_once() -> Iterator[None]:
         return
     # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
     handled = [ending for ending in ENDING if signal.getsignal(ending) is not signal.SIG_IGN]
-    arrived, signalled = os.pipe()
-    os.set_blocking(signalled, False)
-    over = threading.Event()
-    threading.Thread(target=_watch, args=(arrived, over), name="interrupts", daemon=True).start()
+    read_end, write_end = os.pipe()
+    os.set_blocking(write_end, False)
+    block_ended = threading.Event()
+    threading.Thread(target=_watch, args=(read_end, block_ended), name="interrupts", daemon=True).start()
     # The signal handler in C writes the number of the signal to this pipe at once, even during a library call.
-    before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
+    before = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
     for number in handled:
         signal.signal(number, _end)
     try:
@@ -174,18 +174,18 @@ def end_at_once() -> Iterator[None]:
         for number in handled:
             signal.signal(number, signal.SIG_DFL)
         signal.set_wakeup_fd(before)
-        over.set()
+        block_ended.set()
         # Closing the pipe is not enough, because a forked process has a copy of this end.
-        os.write(signalled, bytes([OVER]))
-        os.close(signalled)
+        os.write(write_end, bytes([END_OF_BLOCK]))
+        os.close(write_end)
 
 
-def _watch(arrived: int, over: threading.Event) -> None:
+def _watch(read_end: int, block_ended: threading.Event) -> None:
     """Wait for a signal of `ENDING`, and end the process if the main thread does not end it in `SIGNAL_GRACE_S`."""
-    while (number := os.read(arrived, 1)[0]) != OVER:
-        if number in ENDING and not over.wait(SIGNAL_GRACE_S):
+    while (number := os.read(read_end, 1)[0]) != END_OF_BLOCK:
+        if number in ENDING and not block_ended.wait(SIGNAL_GRACE_S):
             _end(number)
-    os.close(arrived)
+    os.close(read_end)
 
 
 def _end(number: int, frame: FrameType | None = None) -> None:

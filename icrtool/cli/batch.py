@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 from msgspec.structs import replace
 
-from icrtool.cli import options, when_used
+from icrtool.cli import lazy_imports, options
 from icrtool.cli.options import LOG, PLACE, POSITIVE, Exports, flag, option
 from icrtool.cli.printing import LiveLine, Printer, print_error
 from icrtool.records.text import LogText, counted, escaped, shortened
 
-with when_used():
+with lazy_imports():
     from icrtool.fleet import batch as batches
     from icrtool.fleet import fleet_files, one_log
     from icrtool.output import text_blocks

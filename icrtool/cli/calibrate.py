@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from icrtool.cli import options, when_used
+from icrtool.cli import lazy_imports, options
 from icrtool.cli.inputs import check_run_config, grounds_of, read_calibration, runs_named
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, PLACE, option
 from icrtool.cli.printing import Printer
 
-with when_used():
+with lazy_imports():
     from icrtool import errors
     from icrtool.alignment import align, corrections, estimator, wheel_units
     from icrtool.calibration import error_growth, pooled, sensor_findings

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import click
 
-from icrtool.cli import options, when_used
+from icrtool.cli import lazy_imports, options
 from icrtool.cli.fit import fitted_log
 from icrtool.cli.inputs import RUNS_FOLDER, ResultPlace, check_run_config, logs_of, run_directories
 from icrtool.cli.options import POSITIVE, Exports, choice, flag, option
@@ -17,7 +17,7 @@ from icrtool.records.choices import Reference, Starts
 from icrtool.records.places import Place, UrlPath, path_of
 from icrtool.records.text import LogText, escaped
 
-with when_used():
+with lazy_imports():
     from icrtool import errors, pipeline
     from icrtool.dropout_analysis import dropout_report
     from icrtool.logs.containers import recording_files
@@ -125,7 +125,7 @@ def dropout_report_command(
     )
     verdicts = [verdict for result in reports.values() for verdict in result.document.gates]
     options.check_compared(verdicts)
-    inputs.exit_if_failed("runs and logs", gate_failed=not all(verdict.passed for verdict in verdicts))
+    inputs.exit_if_failed("runs and logs", limit_not_met=not all(verdict.passed for verdict in verdicts))
 
 
 def plan_sources(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast, get_args
 
 import click
 
-from icrtool.cli import when_used
+from icrtool.cli import lazy_imports
 from icrtool.cli.inputs import RUNS_FOLDER, is_log, read_calibration_and_run
 from icrtool.cli.options import FILE, PLACE, choice, flag, option
 from icrtool.cli.printing import Printer, write_or_print
@@ -16,7 +16,7 @@ from icrtool.records.choices import ControllerTarget, TrajectoryFormat
 from icrtool.records.places import Below
 from icrtool.records.text import escaped
 
-with when_used():
+with lazy_imports():
     from icrtool import errors
     from icrtool.calibration import localization, record
     from icrtool.output import run_directory

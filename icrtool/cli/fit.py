@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from icrtool.cli import options, when_used
+from icrtool.cli import lazy_imports, options
 from icrtool.cli.inputs import ResultPlace, logs_of, run_directories
 from icrtool.cli.options import PLACE, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer, print_error
@@ -19,7 +19,7 @@ from icrtool.records.choices import StatesFormat
 from icrtool.records.places import Place, UrlPath, path_of
 from icrtool.records.text import LogText, escaped
 
-with when_used():
+with lazy_imports():
     from icrtool import errors, pipeline
     from icrtool.alignment import wheel_units
     from icrtool.logs import read_log, topic_poses
@@ -96,7 +96,7 @@ def fit_command(
             printer.show([*run_tables.run_blocks(run.document), *run_tables.next_blocks(run.document, where, examine)])
             printer.warn_about(run, most=MOST_WARNINGS)
     printer.json("fit", {"logs": inputs.documents})
-    inputs.exit_if_failed("logs", gate_failed=strict and not all_usable)
+    inputs.exit_if_failed("logs", limit_not_met=strict and not all_usable)
 
 
 @contextmanager

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from icrtool.cli import when_used
+from icrtool.cli import lazy_imports
 from icrtool.cli.printing import Printer
 from icrtool.records.places import Below, Place, UrlPath, place_of
 from icrtool.records.text import LogText, escaped
 
-with when_used():
+with lazy_imports():
     from icrtool import errors
     from icrtool.calibration import pooled
     from icrtool.estimation import fit

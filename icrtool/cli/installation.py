@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import click
 from click.shell_completion import BashComplete, CompletionItem, add_completion_class, get_completion_class
 
-from icrtool.cli import options, when_used
+from icrtool.cli import lazy_imports, options
 from icrtool.cli.options import flag, option
 from icrtool.cli.printing import Printer, write_or_print
 from icrtool.output.text_blocks import Line, Table
 
-with when_used():
+with lazy_imports():
     from icrtool import config
     from icrtool.output.tables import configuration
 

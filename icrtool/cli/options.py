@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast, get_args
 import click
 from click.shell_completion import CompletionItem
 
-from icrtool.cli import when_used
+from icrtool.cli import lazy_imports
 from icrtool.cli.inputs import ResultPlace
 from icrtool.cli.printing import Printer
 from icrtool.records.choices import FigureSet
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.text import did_you_mean, escaped
 
-with when_used():
+with lazy_imports():
     from icrtool import config, errors
     from icrtool.dropout_analysis import report
     from icrtool.logs.containers import open_log

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import click
 
 from icrtool import __version__
-from icrtool.cli import when_used
+from icrtool.cli import lazy_imports
 from icrtool.output.text_blocks import Block, Line, Table, fit_table, format_blocks, printed_parts
 from icrtool.records.text import LONGEST_NAME, counted, escaped, listed, shortened
 
-with when_used():
+with lazy_imports():
     from icrtool import errors
     from icrtool.kernels import compiled
     from icrtool.output import text_format
@@ -223,16 +223,17 @@ class Inputs:
             named = any(part in str(err) for part in (name, escaped(source.name), escaped(source.stem)))
             print_error(str(err) if named else f"{name}: {err}")
 
-    def exit_if_failed(self, inputs_word: str, *, gate_failed: bool = False) -> None:
-        """Exit with status 3 if an acceptance limit was not met, else with 1 if an input could not be used.
+    def exit_if_failed(self, inputs_word: str, *, limit_not_met: bool = False) -> None:
+        """Exit with status 3 if a limit was not met, else with status 1 if an input could not be used.
 
-        `inputs_word` is the word for the inputs in the last error.
+        `inputs_word` is the word for the inputs in the last error. `limit_not_met`: an acceptance limit was not met or,
+        with --strict, a run must not be used.
         """
         failed = [shortened(escaped(source), LONGEST_NAME) for source in self.errors]
         if failed and len(self.documents) > 1:
             print_error(f"{len(failed)} of {len(self.documents)} {inputs_word} could not be used: {listed(failed, 5)}")
-        if gate_failed or failed:
-            raise SystemExit(3 if gate_failed else 1)
+        if limit_not_met or failed:
+            raise SystemExit(3 if limit_not_met else 1)
 
 
 class LiveLine:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from icrtool.cli import dropout_report, options, when_used
+from icrtool.cli import dropout_report, lazy_imports, options
 from icrtool.cli.inputs import (
     RUNS_FOLDER,
     ResultPlace,
@@ -25,7 +25,7 @@ from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, Below, Place, UrlPath, is_special, path_of
 from icrtool.records.text import escaped
 
-with when_used():
+with lazy_imports():
     from icrtool import errors
     from icrtool.calibration import transfer
     from icrtool.dropout_analysis import dropout_report as analysis

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import click
 
-from icrtool.cli import options, when_used
+from icrtool.cli import lazy_imports, options
 from icrtool.cli.inputs import RUNS_FOLDER
 from icrtool.cli.options import (
     FILE,
@@ -27,7 +27,7 @@ from icrtool.cli.options import (
 from icrtool.cli.printing import Printer
 from icrtool.records.choices import HeadingConvention, PathKind, PresetName, StudyName, WheelMessages
 
-with when_used():
+with lazy_imports():
     from icrtool import errors
     from icrtool.logs import write_log
     from icrtool.output import simulation_files

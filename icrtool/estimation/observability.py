@@ -46,10 +46,10 @@ Y_OF_STRETCH, X_OF_STRETCH = 0.04, 0.1
 """Standard deviation of the y ICRs, and of x_icr, of a stretch about those of the drive before it is driven, as a share
 of y right - y left. Ground and slip differ between stretches.
 
-x_icr also changes with the speed of a turn: the prior of side slip, 0.1 s over a turn gain of 0.6
-(`icrtool.motion.models`), gives 0.1 of 0.9 to 1.8 m at 0.5 to 1.1 m/s."""
+x_icr also changes with the speed of a turn: a side slip of 0.1 s over a turn gain of 0.6 changes it by 0.1 of 0.9 to
+1.8 m at 0.5 to 1.1 m/s."""
 
-SLIPS = 0.4
+USUAL_EXCESS = 0.4
 """Excess of y right - y left over the track width, as a share of b, above which slip varies as usual. With a smaller
 excess, the variation is smaller in proportion."""
 
@@ -191,14 +191,16 @@ def final_covariance(
     width_m, is_recent = windows.separation_m, windows.track.t[windows.begin] >= since_s
     if np.count_nonzero(is_recent) < 2:
         return filter_covariance + np.eye(3) * width_m**2
-    forgets = process_icr_mps**2 * REFERENCE_STEP_S
-    memory_m = float(np.trace(filter_covariance)) / 3.0 / forgets if forgets > 0.0 else math.inf
+    icr_noise_m2_per_m = process_icr_mps**2 * REFERENCE_STEP_S
+    memory_m = float(np.trace(filter_covariance)) / 3.0 / icr_noise_m2_per_m if icr_noise_m2_per_m > 0.0 else math.inf
     weight = np.tile(np.exp((windows.end_m - windows.end_m[-1]) / memory_m)[is_recent], 3)
     direction, rows = np.repeat(np.arange(3), np.count_nonzero(is_recent)), np.tile(is_recent, 3)
     residuals, prior = windows.residuals[rows], np.diag(prior_std(width_m, windows.heading_std_rad) ** -2.0)
     scale = np.hypot(scale_by_kind(residuals, direction), windows.noise[direction]) / np.sqrt(weight)
     at_final_icrs = Linearised(residuals=residuals, jacobian=windows.jacobian[rows], scale=scale, prior=prior)
-    slip = 1.0 if track_width_m is None else min(max(abs(width_m / track_width_m - 1.0) / SLIPS, LEAST_SLIP), 1.0)
+    slip = (
+        1.0 if track_width_m is None else min(max(abs(width_m / track_width_m - 1.0) / USUAL_EXCESS, LEAST_SLIP), 1.0)
+    )
     of_stretch = slip * width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
     return sandwich_covariance(at_final_icrs, np.tile(windows.stretch[is_recent], 3), of_stretch)[:3, :3]
 
@@ -222,7 +224,7 @@ AT_LIMIT = 1.1
 TURNS_NEEDED_RAD = math.pi
 """Sum of the turns to both sides below which a drive lacks turns [rad]."""
 
-STEERS = 0.1
+STEERING_RATIO = 0.1
 """Ratio of the turn by the difference of the sides to the robot's turn below which the sides do not turn the robot."""
 
 SURELY_TURNED_RAD = 0.1
@@ -318,7 +320,7 @@ def _lacking(
     turned = np.abs(windows.turned[1:])
     steered = float(turned[turned > SURELY_TURNED_RAD].sum())
     turned_rad = turned_right + turned_left
-    if steered > TURNS_NEEDED_RAD and turned_rad < STEERS * steered:
+    if steered > TURNS_NEEDED_RAD and turned_rad < STEERING_RATIO * steered:
         angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(turned_rad):.0f}°"
         why = f"{angles}: it steers as a car does, and has no track ICRs, or one side is a copy of the other"
         return [first, note("steers_as_car", why)]
@@ -328,12 +330,12 @@ def _lacking(
     return [first, note("turns_lacking", why)]
 
 
-def lacking_turns(right_rad: float, residual_rad: float) -> str:
+def lacking_turns(right_rad: float, left_rad: float) -> str:
     """Return which turns a drive lacks and what to drive, from its turns to both sides; empty if it has enough."""
-    total = right_rad + residual_rad
+    total = right_rad + left_rad
     if total < TURNS_NEEDED_RAD:
         return f"hardly any turns ({math.degrees(total):.0f}° in all): {SPIN_BOTH}"
-    if min(right_rad, residual_rad) < ONE_DIRECTION * max(right_rad, residual_rad):
-        side = "left" if right_rad > residual_rad else "right"
+    if min(right_rad, left_rad) < ONE_DIRECTION * max(right_rad, left_rad):
+        side = "left" if right_rad > left_rad else "right"
         return f"turned in one direction only: drive two full turns on the spot, or circles, to the {side}"
     return ""

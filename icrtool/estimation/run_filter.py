@@ -41,7 +41,7 @@ OUTAGE_IN_INTERVALS = 5.0
 """Shortest GNSS outage, in usual intervals between fixes. Both limits must be exceeded."""
 
 
-LONGEST_CARRY_S, CLEARLY = 1.0, 2.0
+LONGEST_CARRY_S, LEAST_STD_RATIO = 1.0, 2.0
 """Longest time for which a precise heading is extended by the wheels' turn [s], and smallest ratio of the filter's
 standard deviation to its own. With a smaller ratio the filter's heading is kept."""
 
@@ -105,7 +105,7 @@ def run_filter(
     check_start(config)
     _check_motion(sensors)
     changes_s = tuple(sorted(set(changes_s)))
-    parameters, output, noise = run_adaptively(sensors, config, warm_start, changes_s)
+    parameters, output, noise = filter_with_adapted_noise(sensors, config, warm_start, changes_s)
     gap_s = wheel_gap_s(config, (sensors.wheels.stamp_ns - sensors.wheels.stamp_ns[0]) / 1e9)
     table = _states(sensors.wheels, output)
     if table.fault:
@@ -177,7 +177,7 @@ TOLERATED_NIS = 1.25
 """Largest mean NIS of a stream, per degree of freedom, that is tolerated. Each NIS is limited to its gate; with the
 right noise the mean is 1."""
 
-STEP = 2.0
+NOISE_FACTOR = 2.0
 """Factor between two tried process noises."""
 
 LARGEST_POSITION_MPS = 10.0
@@ -189,7 +189,7 @@ LARGEST_HEADING_DEGPS = 120.0
 TAIL_DEGREES = 4.0
 """Degrees of freedom of Student's t. Lange, Little and Taylor 1989 recommend this value for few, gross outliers."""
 
-LIKE_COST = 0.1
+EQUAL_COST_MARGIN = 0.1
 """Largest difference of two costs per measurement that count as equal. An error of 5 % in both standard deviations has
 this cost."""
 
@@ -203,7 +203,7 @@ MOST_SEARCHED_SAMPLES = 60_000
 """Largest number of wheel samples in the search: ten minutes at 100 Hz."""
 
 
-def run_adaptively(
+def filter_with_adapted_noise(
     sensors: SensorData, config: Config, warm_start: WarmStart | None, changes_s: tuple[float, ...]
 ) -> tuple[FilterParameters, FilterOutput, ProcessNoise]:
     """Return parameters and output of the filter, and the process noise of the pose in it.
@@ -231,14 +231,14 @@ def run_adaptively(
     del output, nis  # The memory is freed for the next run.
     wander_rad, largest = sensors.facts.turn_wander_rad, LARGEST_HEADING_DEGPS
     if wander_rad is not None:
-        largest = min(largest, STEP * math.degrees(wander_rad) / math.sqrt(REFERENCE_STEP_S))
+        largest = min(largest, NOISE_FACTOR * math.degrees(wander_rad) / math.sqrt(REFERENCE_STEP_S))
     part = _busiest_part(sensors)
     moving = part.moving()
     best = find_noise(
         lambda tried: innovation_cost(run(part, tried)[1], moving),
         noise,
-        positions=settings.process_position_mps == "auto",
-        headings=settings.process_heading_degps is None,
+        search_position=settings.process_position_mps == "auto",
+        search_heading=settings.process_heading_degps is None,
         largest_degps=largest,
     )
     return *run(sensors, best), best
@@ -258,8 +258,8 @@ def find_noise(
     cost: Callable[[ProcessNoise], float],
     start: ProcessNoise,
     *,
-    positions: bool,
-    headings: bool,
+    search_position: bool,
+    search_heading: bool,
     largest_degps: float = LARGEST_HEADING_DEGPS,
 ) -> ProcessNoise:
     """Return the smallest process noise, by doublings of `start`, whose cost is about the smallest cost.
@@ -267,27 +267,27 @@ def find_noise(
     Parameters
     ----------
     cost : returns the cost of a noise, for example `innovation_cost`
-    positions, headings : search for the noise of the position, and of the heading
+    search_position, search_heading : search for the noise of the position, and of the heading
     largest_degps : upper limit of the heading's noise, from the difference between the turns of heading and wheels
 
     Notes
     -----
     Both noises are searched for in turn, each over all its doublings: if the noise is far too small, nearly all
-    measurements are rejected, and the first doublings may change nothing. Costs within `LIKE_COST` of the smallest cost
-    count as equal.
+    measurements are rejected, and the first doublings may change nothing. Costs within `EQUAL_COST_MARGIN` of the
+    smallest cost count as equal.
     """
     cost_of = functools.cache(cost)
-    largest = (LARGEST_POSITION_MPS if positions else 0.0, largest_degps if headings else 0.0)
+    largest = (LARGEST_POSITION_MPS if search_position else 0.0, largest_degps if search_heading else 0.0)
     best = start
-    for _ in range(MOST_ROUNDS if positions and headings else 1):
+    for _ in range(MOST_ROUNDS if search_position and search_heading else 1):
         before = best
         for name, first, last in zip(ProcessNoise._fields, start, largest, strict=True):
             steps = [first]
-            while 0.0 < steps[-1] * STEP <= last:
-                steps.append(steps[-1] * STEP)
+            while 0.0 < steps[-1] * NOISE_FACTOR <= last:
+                steps.append(steps[-1] * NOISE_FACTOR)
             if last > 0.0:
                 tried = [best._replace(**{name: value}) for value in steps]
-                limit = min(map(cost_of, tried)) + LIKE_COST
+                limit = min(map(cost_of, tried)) + EQUAL_COST_MARGIN
                 best = next(noise for noise in tried if cost_of(noise) <= limit)
         if best == before:
             break
@@ -358,7 +358,7 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
         age = table.t_s[chunk] - seen_s[last]
         recent = (last >= 0) & (age < LONGEST_CARRY_S)
         std = np.sqrt(headings.var_rad2[rows[last]] + TURN_WANDER_RAD**2 * np.abs(age))
-        clear = recent & (CLEARLY * std < table.std_heading_rad[chunk])
+        clear = recent & (LEAST_STD_RATIO * std < table.std_heading_rad[chunk])
         np.add(psi[chunk], off[last], out=psi[chunk], where=clear)
         np.copyto(table.std_heading_rad[chunk], std, where=clear)
 
@@ -376,12 +376,12 @@ def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> In
     if len(used) < 2:
         return np.empty((0, 2), np.int64)
     interval = np.diff(used)
-    longest = max(OUTAGE_S * 1e9, OUTAGE_IN_INTERVALS * float(np.median(interval)))
-    edges = np.flatnonzero(interval > longest)
+    shortest_outage_ns = max(OUTAGE_S * 1e9, OUTAGE_IN_INTERVALS * float(np.median(interval)))
+    edges = np.flatnonzero(interval > shortest_outage_ns)
     spans = [(int(used[i]), int(used[i + 1])) for i in edges]
-    if used[0] - table.stamp_ns[0] > longest and lost[gnss.stamp_ns < used[0]].any():
+    if used[0] - table.stamp_ns[0] > shortest_outage_ns and lost[gnss.stamp_ns < used[0]].any():
         spans.insert(0, (int(table.stamp_ns[0]), int(used[0])))
-    if table.stamp_ns[-1] - used[-1] > longest:
+    if table.stamp_ns[-1] - used[-1] > shortest_outage_ns:
         spans.append((int(used[-1]), int(table.stamp_ns[-1]) + 1))
     return np.array(spans, np.int64).reshape(-1, 2)
 

@@ -10,7 +10,7 @@ import numpy as np
 from icrtool.alignment.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import configured_noise
-from icrtool.estimation.run_filter import LARGEST_POSITION_MPS, STEP
+from icrtool.estimation.run_filter import LARGEST_POSITION_MPS, NOISE_FACTOR
 from icrtool.kernels.arrays import Bytes, Floats
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.records.measurements import Finding, WheelFacts
@@ -106,7 +106,7 @@ def unusable_reasons(
     for word, share in rejected.items():
         if share > UNUSABLE_SHARE:
             reasons.append(note(MOSTLY_REJECTED[word], f"{100 * share:.0f} % of the {word} rejected"))
-    if noise.position_mps * STEP > LARGEST_POSITION_MPS:
+    if noise.position_mps * NOISE_FACTOR > LARGEST_POSITION_MPS:
         reasons.append(note("motion_unexplained", "the wheels explain almost none of the motion"))
     elif noise.heading_degps > USELESS_HEADING_DEGPS and (why := _why_turns_unexplained(wheels)):
         reasons.append(note("turns_unexplained", why))

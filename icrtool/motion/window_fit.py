@@ -280,7 +280,7 @@ class PooledFit(FittedModel):
         return self._left_out[fold]
 
     def _fit_without(self, fold: Fold) -> Prediction | None:
-        """Return the result of `without`, which is kept."""
+        """Compute the result of `fit_without`, which keeps it."""
         pool, i, k = self.pool, fold.recording, len(self.parameters)
         clear = pool.clear_of(fold)
         if np.count_nonzero(clear) < FEWEST_RESIDUALS:

@@ -23,7 +23,7 @@ print("loaded", flush=True)
 COMMAND = """
 import signal, sys
 from pathlib import Path
-from icrtool.cli import end_at_once
+from icrtool.cli import exit_on_signals
 from icrtool.records.process_resources import unfinished
 
 def command():
@@ -33,7 +33,7 @@ def command():
         import loading
         signal.pause()
 
-with end_at_once():
+with exit_on_signals():
     command()
 """
 
@@ -64,10 +64,10 @@ def test_what_was_ignored_stays_ignored(tmp_path: Path) -> None:
 
 UNDISTURBED = """
 import os, signal, sys, time
-from icrtool.cli import end_at_once
+from icrtool.cli import exit_on_signals
 from icrtool.records.process_resources import undisturbed
 
-with end_at_once():
+with exit_on_signals():
     with undisturbed():
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0.1)
@@ -84,7 +84,7 @@ def test_a_signal_waits_for_the_end_of_a_block_that_it_must_not_disturb() -> Non
 COMPUTING = """
 import hashlib, os, signal, sys, threading
 from pathlib import Path
-from icrtool.cli import end_at_once
+from icrtool.cli import exit_on_signals
 from icrtool.records.process_resources import unfinished
 
 def command():
@@ -95,7 +95,7 @@ def command():
         threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
         hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)  # minutes of compiled code that looks for no signal
 
-with end_at_once():
+with exit_on_signals():
     command()
 """
 
@@ -111,7 +111,7 @@ def test_compiled_code_that_looks_for_no_signal_is_ended_and_leaves_nothing(tmp_
 
 AT_THE_END = """
 import hashlib, os, signal, sys, threading
-from icrtool.cli import end_at_once
+from icrtool.cli import exit_on_signals
 
 def compute():
     hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
@@ -121,7 +121,7 @@ def command():
     os.kill(os.getpid(), signal.SIGTERM)
     signal.pause()
 
-with end_at_once():
+with exit_on_signals():
     command()
 """
 
@@ -136,7 +136,7 @@ def test_a_thread_that_computes_does_not_hold_up_the_end() -> None:
 
 IN_A_CALLBACK = """
 import os, signal, time, weakref
-from icrtool.cli import end_at_once
+from icrtool.cli import exit_on_signals
 
 def gone(_):
     os.kill(os.getpid(), signal.SIGINT)
@@ -148,7 +148,7 @@ def command():
     del thing
     time.sleep(60)
 
-with end_at_once():
+with exit_on_signals():
     command()
 """
 

@@ -16,6 +16,6 @@ def in_this_process(request: bytes, timeout_s: float, stage: object = None) -> F
 
     The processes of a batch have their own tests: tests/unit/fleet/test_batch.py, test_signals.py and test_terminal.py.
     """
-    # Two threads must not be the first to use a module (`icrtool.cli.when_used`).
+    # Two threads must not be the first to use a module (`icrtool.cli.lazy_imports`).
     with ONE_AT_A_TIME:
         return process_log(decode_request(request), lambda _: None)

@@ -60,14 +60,14 @@ FREE_STATES_BYTES = 1 << 29
 file. The states of a robot that is parked for hours compress by a large ratio."""
 
 
-def write_states(table: States, path: Path, states: StatesFormat) -> None:
+def write_states(states: States, path: Path, file_format: StatesFormat) -> None:
     """Write the states to a new file.
 
     Parameters
     ----------
-    table : the recorded states
+    states : the recorded states
     path : path of the new file
-    states : format of the file
+    file_format : format of the file
 
     Raises
     ------
@@ -79,7 +79,7 @@ def write_states(table: States, path: Path, states: StatesFormat) -> None:
     CSV numbers have the shortest form that reads back to the same double; whole numbers keep a ``.0``, so that pandas
     does not take them for integers.
     """
-    if states == "parquet":
+    if file_format == "parquet":
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -90,7 +90,7 @@ def write_states(table: States, path: Path, states: StatesFormat) -> None:
                 len(values),
                 [None, pa.py_buffer(np.ascontiguousarray(values))],
             )
-            for name, values in table.columns().items()
+            for name, values in states.columns().items()
         }
         with path.open("xb") as file:
             pq.write_table(
@@ -99,16 +99,16 @@ def write_states(table: States, path: Path, states: StatesFormat) -> None:
             )  # fmt: skip
     else:
         with path.open("xb") as file:
-            file.writelines(_csv_chunks(table))
+            file.writelines(_csv_chunks(states))
 
 
-def read_states(place: Place, states: StatesFormat, *, whole: bool = True) -> States:
+def read_states(place: Place, file_format: StatesFormat, *, whole: bool = True) -> States:
     """Return the states in a file that `write_states` wrote.
 
     Parameters
     ----------
     place : place of the file
-    states : format of the file
+    file_format : format of the file
     whole : hold all columns in memory; otherwise the standard deviations in a Parquet file are read each time they are
         used
 
@@ -123,7 +123,7 @@ def read_states(place: Place, states: StatesFormat, *, whole: bool = True) -> St
 
     types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS_OF_STATES}
     try:
-        if states == "parquet":
+        if file_format == "parquet":
             import pyarrow.parquet as pq
 
             with open_regular(place) as source, pq.ParquetFile(source) as file:

@@ -169,10 +169,13 @@ def warnings_line(notes: Sequence[Note]) -> str:
     return f"{counted(count, 'warning')} (-v): {first.finding}" if first is not None else ""
 
 
-def number_blocks(summary: RunDocument, own_numbers: ControllerNumbers | None = None) -> list[Block]:
-    """Return the numbers for a controller, of the run or `fitted`, and the ICRs from which they are computed."""
+def number_blocks(summary: RunDocument, controller_numbers: ControllerNumbers | None = None) -> list[Block]:
+    """Return the numbers for a controller, and the ICRs from which they are computed.
+
+    `controller_numbers`: numbers to print instead of the numbers of the run.
+    """
     width_m, icrs = summary.config.robot.track_width_m, [summary.icr_of_drive(column) for column in ICR_COLUMNS]
-    numbers = own_numbers or summary.controller
+    numbers = controller_numbers or summary.controller
     if width_m is not None and numbers is not None:
         return blocks_of_numbers(numbers, width_m, icrs)
     why = "no multiplier and no no-slip model: robot.track_width_m is not known (--robot, --set)"

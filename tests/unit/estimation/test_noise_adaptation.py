@@ -39,17 +39,22 @@ def test_the_search_passes_over_doublings_that_change_nothing(plateau: float) ->
         tried.append(noise)
         return bowl(best, tried, plateau)
 
-    assert find_noise(cost, FIELD.process_noise, positions=True, headings=True) == pytest.approx(best)
+    assert find_noise(cost, FIELD.process_noise, search_position=True, search_heading=True) == pytest.approx(best)
     assert len(tried) == len(set(tried)) <= 20
 
 
 def test_of_noises_that_are_as_good_the_smallest_is_taken() -> None:
-    assert find_noise(lambda noise: 3.0, FIELD.process_noise, positions=True, headings=True) == FIELD.process_noise
+    assert (
+        find_noise(lambda noise: 3.0, FIELD.process_noise, search_position=True, search_heading=True)
+        == FIELD.process_noise
+    )
 
 
 def test_what_is_configured_is_not_searched_for() -> None:
     best = ProcessNoise(4.8, 28.0)
-    found = find_noise(lambda noise: bowl(best, [noise]), FIELD.process_noise, positions=False, headings=True)
+    found = find_noise(
+        lambda noise: bowl(best, [noise]), FIELD.process_noise, search_position=False, search_heading=True
+    )
     assert found == pytest.approx((FIELD.process_noise.position_mps, 28.0))
 
 
