@@ -37,5 +37,5 @@ def test_a_twist_in_enu_turns_left_where_the_right_side_is_faster() -> None:
     np.testing.assert_allclose(calibration.twist(0.5, 0.7), [forward, -left, -omega])
     pairs = np.array([0.1, 0.4]), np.array([0.3, 0.2])
     assert calibration.twist(*pairs, frame="enu").shape == (3, 2)
-    with pytest.raises(ValueError, match="ned or enu"):
+    with pytest.raises(ValueError, match="neither ned nor enu"):
         calibration.twist(0.5, 0.7, frame="flu")  # type: ignore[arg-type]
