@@ -21,7 +21,7 @@ OF_FILES: dict[str, Explanation] = {
         "info",
         "The columns of a table are separated by semicolons or tabs, perhaps with decimal commas.",
         "The table is read in that form.",
-        "None is needed. Check that the table has the named form.",
+        "Optional: check that the table has the named form.",
     ),
     "log_part_unreadable": Explanation(
         "warning",
@@ -32,7 +32,7 @@ OF_FILES: dict[str, Explanation] = {
     "log_limit_reached": Explanation(
         "warning",
         "The log exceeds a limit that protects this machine: number of topics or entries, size when unpacked.",
-        "What is beyond the limit is not read.",
+        "Data beyond the limit are not read.",
         "Record fewer topics, or split the log. Do not unpack an archive that you do not trust.",
     ),
     "log_parts_contradict": Explanation(
@@ -44,7 +44,7 @@ OF_FILES: dict[str, Explanation] = {
     "log_more_problems": Explanation(
         "warning",
         "More than 20 problems were found while a file was read.",
-        "Only the first 20 are listed; the others were handled as the first ones.",
+        "Only the first 20 are listed; the others were handled in the same manner.",
         "Copy the log again from where it was recorded.",
     ),
     "messages_unreadable": Explanation(
@@ -74,7 +74,7 @@ OF_FILES: dict[str, Explanation] = {
     "fix_bursts": Explanation(
         "info",
         "Positions share stamps or arrive several at a time: whole seconds, a serial adapter or a radio link.",
-        "Their stamps are spread over the time since the ones before; the delay of the position is estimated as usual.",
+        "Their stamps are spread over the time since the packet before; the delay is estimated as usual.",
         "Have the driver stamp each position when it is measured.",
     ),
     "datum_far": Explanation(
@@ -87,7 +87,7 @@ OF_FILES: dict[str, Explanation] = {
         "warning",
         "Positions of the wheels begin again: the base restarted, or lost its counts.",
         "The distance driven in that gap is not known; no trial crosses it.",
-        "None is needed.",
+        "Nothing.",
     ),
     "stamps_shared": Explanation(
         "warning",
@@ -107,7 +107,7 @@ OF_FILES: dict[str, Explanation] = {
 OF_CLOCKS: dict[str, Explanation] = {
     "clock_shifted": Explanation(
         "warning",
-        "Speeds or turns of positions or headings match the wheels some seconds earlier or later: another clock.",
+        "The positions or headings have a clock that is seconds ahead of or behind the clock of the wheels.",
         "The stream was moved by that time.",
         "Set the clocks of robot and receiver; GPS time is 18 s ahead of UTC.",
     ),
@@ -149,9 +149,9 @@ OF_CLOCKS: dict[str, Explanation] = {
     ),
     "delay_corrected": Explanation(
         "info",
-        "Positions or headings lag the wheels, by the motion of this drive.",
+        "The motion of this drive shows that positions or headings lag the wheels.",
         "The stream is moved by the delay.",
-        "None is needed. `frames.reference_delay_s` and `frames.heading_delay_s` set a known delay.",
+        "Nothing. `frames.reference_delay_s` and `frames.heading_delay_s` set a known delay.",
     ),
 }
 """Codes of findings about clocks."""
@@ -172,7 +172,7 @@ OF_WHEELS: dict[str, Explanation] = {
     "wheels_limited": Explanation(
         "warning",
         "The wheel speeds end at a largest value that they hold, and the robot moves more there than elsewhere.",
-        "ICRs and multiplier are those of speeds that were cut off.",
+        "ICRs and multiplier describe speeds that were cut off at this value.",
         "Record the speeds before they are cut off, or drive more slowly.",
     ),
     "wheels_from_pose": Explanation(
@@ -183,7 +183,7 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "wheels_commanded": Explanation(
         "warning",
-        "No measured wheel speeds were found: the topic holds commanded ones.",
+        "No measured wheel speeds were found: the topic holds commanded speeds.",
         "The difference between commands and wheel speeds goes into the ICRs and delays.",
         "Record encoders or joint states. `topics.wheels` chooses a topic.",
     ),
@@ -215,25 +215,25 @@ OF_WHEELS: dict[str, Explanation] = {
         "info",
         "Each wheel, or each side, is stated in messages of its own.",
         "They are joined by time: positions are interpolated, speeds held.",
-        "None is needed. Wheels in one message have no error of time.",
+        "Nothing. Wheels in one message have no error of time.",
     ),
     "counter_begins_again": Explanation(
         "info",
         "The numbers of a wheel begin again at a limit, as counters of few bits and angles do.",
         "The numbers are continued beyond the limit.",
-        "None is needed. Check the named limit.",
+        "Optional: check the named limit.",
     ),
     "header_clock": Explanation(
         "info",
         "All header stamps come from one clock, and log time differs from it, as in a simulation or a replay.",
         "The header stamps are used.",
-        "None is needed. `topics.clock` sets which stamps are used.",
+        "Nothing. `topics.clock` sets which stamps are used.",
     ),
     "gyro_in_degrees": Explanation(
         "info",
         "The turn rates of an inertial unit agree with headings or fixes in deg/s, not in rad/s.",
         "They are converted.",
-        "None is needed. Send rad/s (REP-103).",
+        "Optional: send rad/s (REP-103).",
     ),
     "joints_not_used": Explanation(
         "warning",
@@ -255,9 +255,9 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "wheel_unit_found": Explanation(
         "info",
-        "Wheel speeds are in another unit than their message type states, by the position reference.",
+        "The position reference shows that wheel speeds are not in the unit of their message type.",
         "They are read in the unit that fits.",
-        "None is needed. Check the driver.",
+        "Optional: check the driver.",
     ),
     "wheel_unit_estimated": Explanation(
         "info",
@@ -275,13 +275,13 @@ OF_WHEELS: dict[str, Explanation] = {
         "info",
         "Samples of wheel positions are missing.",
         "The distance that the positions show is driven at constant speed in the gaps.",
-        "None is needed. Look for messages lost by the recorder.",
+        "Optional: look for messages lost by the recorder.",
     ),
     "distance_is_lower_limit": Explanation(
         "info",
         "In a gap, wheel samples and positions are missing, and the robot is in another place after it.",
         "The path in the gap is at least as long as the straight line that is counted.",
-        "None is needed for the ICRs. Look for messages lost by the recorder.",
+        "Nothing for the ICRs. Look for messages lost by the recorder.",
     ),
     "wheel_values_held": Explanation(
         "warning",
@@ -293,13 +293,13 @@ OF_WHEELS: dict[str, Explanation] = {
         "warning",
         "Distance or turns of the wheels differ from the robot's distance or turns by changing amounts, as on ice.",
         "No scale and no delay is corrected; the errors without GNSS are large.",
-        "None is needed on ice, mud and loose ground. On other ground check tyres, tracks and encoders.",
+        "Nothing on ice, mud and loose ground. On other ground check tyres, tracks and encoders.",
     ),
     "wheel_scale_corrected": Explanation(
         "info",
         "The robot goes further or less far than the wheels report.",
         "Both sides are scaled by the estimate.",
-        "None is needed. `wheels.left_scale` and `wheels.right_scale` set known scales.",
+        "Nothing. `wheels.left_scale` and `wheels.right_scale` set known scales.",
     ),
     "wheel_size_wrong": Explanation(
         "warning",
@@ -317,7 +317,7 @@ OF_WHEELS: dict[str, Explanation] = {
         "info",
         "One side goes less far than the other where both report the same distance.",
         "Both sides are scaled by the estimate.",
-        "None is needed. Check tyre pressures; `wheels.left_scale` and `wheels.right_scale` set known scales.",
+        "Optional: check tyre pressures; `wheels.left_scale` and `wheels.right_scale` set known scales.",
     ),
     "side_scale_differs": Explanation(
         "warning",
@@ -349,7 +349,7 @@ OF_WHEELS: dict[str, Explanation] = {
 OF_POSITIONS: dict[str, Explanation] = {
     "positions_interpolated": Explanation(
         "warning",
-        "The positions lie on straight lines between nodes, also where the robot turns: a program interpolated them.",
+        "The positions lie on straight lines between nodes, even where the robot turns: a program interpolated them.",
         "The nodes alone are used; the reference is unknown between them.",
         "Record the positions as they are measured, or more nodes.",
     ),
@@ -357,12 +357,12 @@ OF_POSITIONS: dict[str, Explanation] = {
         "warning",
         "The first fixes lie further from the others than the robot can drive.",
         "They are left out.",
-        "Begin to record when the receiver has a fix.",
+        "Start to record when the receiver has a fix.",
     ),
     "reference_chosen": Explanation(
         "info",
-        "Another position reference agrees better with wheels and heading than the first choice.",
-        "The one that agrees is used.",
+        "Another position reference agrees better with wheels and heading than the topic chosen first.",
+        "The reference that agrees better is used.",
         "`topics.gnss` sets the topic.",
     ),
     "fixes_frozen": Explanation(
@@ -388,13 +388,13 @@ OF_POSITIONS: dict[str, Explanation] = {
         "info",
         "Some fixes are not RTK fixed while most of the log is.",
         "They get the variance of their class.",
-        "None is needed. Check the corrections if there are many.",
+        "Optional: check the corrections if there are many.",
     ),
     "gnss_noise_raised": Explanation(
         "info",
         "Positions scatter by more than they state.",
         "The measured scatter is used as their noise.",
-        "None is needed. `filter.gnss_std_m` states a known noise.",
+        "Nothing. `filter.gnss_std_m` states a known noise.",
     ),
     "fixes_rejected": Explanation(
         "warning",
@@ -412,12 +412,12 @@ OF_POSITIONS: dict[str, Explanation] = {
         "warning",
         "Both ICRs lie to one side of the antenna, and the log does not state where it is.",
         "An antenna off the centre line and sides that slip unequally look the same: y_icr may be shifted.",
-        "Measure the place of the antenna; set `frames.antenna_right_m` and `frames.antenna_forward_m`.",
+        "Measure the position of the antenna; set `frames.antenna_right_m` and `frames.antenna_forward_m`.",
     ),
     "lever_unknown": Explanation(
         "info",
         "It is not known where on the robot the position is measured.",
-        "In the row of the controller numbers the place is a constant of this log.",
+        "Row `controller` uses the position of the sensor that this log shows.",
         "Set `frames.antenna_forward_m` and `frames.antenna_right_m`.",
     ),
 }
@@ -428,7 +428,7 @@ OF_HEADINGS: dict[str, Explanation] = {
         "info",
         "The heading sensor is mounted on its side, or writes its quaternion in another order.",
         "The axis or order that fits is used; the offset is estimated.",
-        "None is needed. Correct the driver or the mounting.",
+        "Optional: correct the driver or the mounting.",
     ),
     "heading_unusable": Explanation(
         "info",
@@ -446,11 +446,11 @@ OF_HEADINGS: dict[str, Explanation] = {
         "info",
         "No stated heading is used.",
         "The heading is estimated from the named sensors, with the stated standard deviation.",
-        "None is needed. A heading of two antennas is more precise.",
+        "Nothing. A heading of two antennas is more precise.",
     ),
     "heading_convention_corrected": Explanation(
         "info",
-        "The heading turns in the opposite sense to the course over ground: its convention (ENU, NED) is the other.",
+        "The heading turns in the opposite sense to the course over ground: it is ENU in place of NED, or reverse.",
         "The convention is changed.",
         "Set `frames.heading` to state it.",
     ),
@@ -470,7 +470,7 @@ OF_HEADINGS: dict[str, Explanation] = {
         "info",
         "The heading differs from the course over ground by a constant angle: mounting, magnetic declination, grid.",
         "The angle is subtracted.",
-        "None is needed. `frames.heading_offset_deg` sets a known angle.",
+        "Nothing. `frames.heading_offset_deg` sets a known angle.",
     ),
     "heading_offset_differs": Explanation(
         "warning",
@@ -494,7 +494,7 @@ OF_HEADINGS: dict[str, Explanation] = {
         "info",
         "A measured heading or gyro counts turns in the other direction.",
         "Its sign is changed in the comparison of models.",
-        "None is needed. Check how the sensor is mounted.",
+        "Optional: check how the sensor is mounted.",
     ),
     "gyro_not_used": Explanation(
         "info",

@@ -13,7 +13,7 @@ OF_RUNS: dict[str, Explanation] = {
         "info",
         "The ICRs are as far apart as the tracks: the robot turns as a differential drive.",
         "ICRs predict the motion no better than the track width.",
-        "None is needed. Check that `robot.track_width_m` was measured, not fitted.",
+        "Optional: check that `robot.track_width_m` was measured, not fitted.",
     ),
     "multiplier_unusual": Explanation(
         "warning",
@@ -23,7 +23,7 @@ OF_RUNS: dict[str, Explanation] = {
     ),
     "icrs_ended_inverted": Explanation(
         "warning",
-        "The right ICR ended left of the left one.",
+        "The right ICR of the filter ended left of the left one; `icrs_inverted` states whether the drive shows them.",
         "The ICRs must not be used.",
         "Check sides and signs of the wheels.",
     ),
@@ -88,7 +88,7 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
     "rows_contradict": Explanation(
         "grave",
         "The drive does not show its ICRs, and the filter and the motion model err by very different amounts.",
-        "One of both is wrong, and nothing shows which.",
+        "One of the two is wrong, and nothing shows which.",
         "Check the other findings: stamps, wheel radius, slip.",
     ),
     "wheels_filtered": Explanation(
@@ -111,7 +111,7 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
     ),
     "icrs_inverted": Explanation(
         "grave",
-        "The right ICR ended left of the left one.",
+        "The right ICR of the filter ended left of the left one, although the drive shows all three ICRs.",
         "No skid-steer robot has such ICRs.",
         "Check sides and signs of the wheels.",
     ),
@@ -137,7 +137,7 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
         "grave",
         "The wheels explain almost none of the turns.",
         "The ICRs mean nothing.",
-        "None is needed on ice. On other ground check the wheel topics and the heading.",
+        "Nothing on ice. On other ground check the wheel topics and the heading.",
     ),
     "windows_contradict": Explanation(
         "grave",
