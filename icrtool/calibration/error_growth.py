@@ -52,7 +52,7 @@ LONGEST_PATH_M = 100_000.0
 Values = TypeVar("Values", Floats, Complexes)
 
 
-class Spread(NamedTuple):
+class ErrorMoments(NamedTuple):
     """Second moments of errors at the ends of windows, in the body frame of their start.
 
     Attributes
@@ -66,16 +66,16 @@ class Spread(NamedTuple):
     xy: Floats
     yy: Floats
 
-    def combined_moments(self, variances: Floats) -> Spread:
+    def combined_moments(self, variances: Floats) -> ErrorMoments:
         """Return the moments (w, 1) of all sources together, for variances (c,) of the sources."""
-        return Spread(*((moments @ variances)[:, None] for moments in self))
+        return ErrorMoments(*((moments @ variances)[:, None] for moments in self))
 
-    def plus(self, other: Spread) -> Spread:
+    def plus(self, other: ErrorMoments) -> ErrorMoments:
         """Return the moments of the sum of two independent errors."""
-        return Spread(*(a + b for a, b in zip(self, other, strict=True)))
+        return ErrorMoments(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-class PathErrors(NamedTuple):
+class PathMoments(NamedTuple):
     """Motion in windows by a model, and moments of its errors.
 
     Attributes
@@ -87,13 +87,13 @@ class PathErrors(NamedTuple):
 
     moved: Complexes
     turned: Floats
-    of_parameters: Spread
-    of_sources: Spread
+    of_parameters: ErrorMoments
+    of_sources: ErrorMoments
 
 
 def path_errors(
     windows: Windows, fitted_model: FittedModel, width_m: float, constants: LogConstants = NO_CONSTANTS
-) -> PathErrors:
+) -> PathMoments:
     """Return displacement and turn of windows by a model, and the moments of their errors.
 
     Parameters
@@ -107,22 +107,22 @@ def path_errors(
     fixed, axes, columns = model_columns(fitted_model.model, fitted_model.complete(motion))
     fixed[OMEGA] += constants.gyro_bias_radps
     # The sources act along the whole path, not only at the ends of the windows.
-    of_start, of_end = (steps.place_t[rows] + constants.wheels_later_s for rows in (windows.begin, windows.end))
-    at = np.unique(np.concatenate([of_start, of_end, steps.t]))
-    path = path_at(steps, lambda rows: (fixed[:, rows], axes, columns[:, rows]), fitted_model.parameters, at)
-    s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)
-    moved, by = displacements(path, s, e)
-    moved_by, turned_by = by[:-1], path.heading_by[:, e] - path.heading_by[:, s]
-    of_parameters = Spread(
+    start_s, end_s = (steps.place_t[rows] + constants.wheels_later_s for rows in (windows.begin, windows.end))
+    times_s = np.unique(np.concatenate([start_s, end_s, steps.t]))
+    path = path_at(steps, lambda rows: (fixed[:, rows], axes, columns[:, rows]), fitted_model.parameters, times_s)
+    s, e = np.searchsorted(times_s, start_s), np.searchsorted(times_s, end_s)
+    moved, moved_derivatives = displacements(path, s, e)
+    moved_by, turn_by = moved_derivatives[:-1], path.heading_by[:, e] - path.heading_by[:, s]
+    of_parameters = ErrorMoments(
         *(np.einsum("kw,kl,lw->w", a, fitted_model.covariance, b)[:, None]
-          for a, b in ((turned_by, turned_by), (moved_by.real, moved_by.real), (moved_by.real, moved_by.imag),
+          for a, b in ((turn_by, turn_by), (moved_by.real, moved_by.real), (moved_by.real, moved_by.imag),
                        (moved_by.imag, moved_by.imag)))
     )  # fmt: skip
-    turned = path.heading[e] - path.heading[s]
-    return PathErrors(moved, turned, of_parameters, _source_moments(path.heading, path.place, s, e))
+    turn_rad = path.heading[e] - path.heading[s]
+    return PathMoments(moved, turn_rad, of_parameters, _source_moments(path.heading, path.place, s, e))
 
 
-def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread:
+def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> ErrorMoments:
     """Return the moments (w, `SOURCES`) of a unit variance of each source, by sums between knots."""
     step = np.diff(place)
     length = np.concatenate([[0.0], np.cumsum(np.abs(step))])
@@ -159,19 +159,19 @@ def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> Spread
     wander = _from_squares(driven, size, square)
     along = np.divide(step**2, driven_m, out=np.zeros(len(step), np.complex128), where=driven_m > 0.0)
     speed = _from_squares(0.0 * driven, zero, sum_between_knots(along) * back**2)
-    moments = [Spread(h**2, p.real**2, p.real * p.imag, p.imag**2) for h, p in constant]
+    moments = [ErrorMoments(h**2, p.real**2, p.real * p.imag, p.imag**2) for h, p in constant]
     ones, none = np.ones(len(s)), np.zeros(len(s))
-    reference = [Spread(ones, none, none, none), Spread(none, ones, none, ones)]
+    reference = [ErrorMoments(ones, none, none, none), ErrorMoments(none, ones, none, ones)]
     ordered = (*moments[:3], wander, moments[3], speed, *reference)
-    return Spread(*(np.column_stack(column) for column in zip(*ordered, strict=True)))
+    return ErrorMoments(*(np.column_stack(column) for column in zip(*ordered, strict=True)))
 
 
-def _from_squares(heading: Floats, size: Floats, square: Floats) -> Spread:
+def _from_squares(heading: Floats, size: Floats, square: Floats) -> ErrorMoments:
     """Return the moments of errors z whose sums of |z|^2 and of z^2 are `size` and `square`."""
-    return Spread(heading, (size + square.real) / 2, square.imag / 2, (size - square.real) / 2)
+    return ErrorMoments(heading, (size + square.real) / 2, square.imag / 2, (size - square.real) / 2)
 
 
-def radius_of_share(spread: Spread, share: float) -> Floats:
+def radius_of_share(spread: ErrorMoments, share: float) -> Floats:
     """Return the radius (w,) [m] that holds a share of normal errors with the moments (w, 1), by bisection."""
     across = _directions(spread)
     low, high = np.zeros(len(across)), 6.0 * np.sqrt(across.max(axis=1))
@@ -183,12 +183,12 @@ def radius_of_share(spread: Spread, share: float) -> Floats:
     return np.asarray((low + high) / 2)
 
 
-def mean_error(spread: Spread) -> Floats:
+def mean_error(spread: ErrorMoments) -> Floats:
     """Return the mean length (w,) [m] of errors that are normal with the moments (w, 1)."""
     return np.asarray(np.sqrt(np.pi / 2.0) * np.sqrt(_directions(spread)).mean(axis=1))
 
 
-def _directions(spread: Spread) -> Floats:
+def _directions(spread: ErrorMoments) -> Floats:
     """Return the squared lengths (w, `ANGLES`) of unit vectors of a quarter circle times the root of the covariance."""
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     middle, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
@@ -197,23 +197,25 @@ def _directions(spread: Spread) -> Floats:
     return np.asarray(large[:, None] * np.cos(angle) ** 2 + small[:, None] * np.sin(angle) ** 2)
 
 
-def fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats, missed: Complexes) -> Floats:
+def fit_variances(
+    length: Floats, sources: ErrorMoments, known: ErrorMoments, turn_error_rad: Floats, error_m: Complexes
+) -> Floats:
     """Return the variances (`SOURCES`,) that best explain the squared errors of windows.
 
     Parameters
     ----------
     length : (w,) length of each window [m]; each length has the same weight
     sources, known : moments by unit variances of the sources, and by errors of the parameters
-    turned, missed : (w,) errors of the turn [rad], and of the displacement, forward + j right [m]
+    turn_error_rad, error_m : (w,) errors of the turn [rad], and of the displacement, forward + j right [m]
     """
     matrix, y = np.zeros((SOURCES, SOURCES)), np.zeros(SOURCES)
     kinds = (
-        (sources.heading, known.heading, turned**2),
-        (sources.xx, known.xx, missed.real**2),
-        (sources.yy, known.yy, missed.imag**2),
+        (sources.heading, known.heading, turn_error_rad**2),
+        (sources.xx, known.xx, error_m.real**2),
+        (sources.yy, known.yy, error_m.imag**2),
     )
-    for metres in np.unique(length):
-        rows = length == metres
+    for length_m in np.unique(length):
+        rows = length == length_m
         for columns, of_parameters, squared in kinds:
             weight = 1.0 / max(float(squared[rows].mean()), 1e-12)
             scaled = weight * columns[rows]
@@ -276,8 +278,8 @@ def forecast_plan(
     Raises
     ------
     DataError
-        The path is shorter than a metre or holds values that are not numbers, or the calibration has no sources of
-        error.
+        The path is shorter than a metre or longer than 100 km, a point is not a number or further than 1e8 m from the
+        origin, a speed is zero, not a number or too fast, or the calibration has no sources of error.
     """
     if not (np.abs([north_m, east_m]) <= FURTHEST_M).all():
         raise DataError("plan", f"a point is not a number, or beyond {FURTHEST_M:g} m", "give metres")
@@ -285,32 +287,39 @@ def forecast_plan(
     length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
     if not 1.0 <= length[-1] <= LONGEST_PATH_M:
         raise DataError("plan", f"the path is {length[-1]:.3g} m long", f"give 1 m to {LONGEST_PATH_M:g} m")
-    at = np.linspace(0.0, length[-1], max(round(length[-1] / STEP_M), 10) + 1)
-    line = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(points) - 2)
-    path = np.interp(at, length, points.real) + 1j * np.interp(at, length, points.imag)
+    path_m = np.linspace(0.0, length[-1], max(round(length[-1] / STEP_M), 10) + 1)
+    segment = np.clip(np.searchsorted(length, path_m, side="right") - 1, 0, len(points) - 2)
+    path = np.interp(path_m, length, points.real) + 1j * np.interp(path_m, length, points.imag)
     step = np.diff(path)
-    speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[line[:-1]]
+    speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[segment[:-1]]
     if not ((np.abs(speed) > 0.0) & (np.abs(speed) <= FASTEST_MPS)).all():
         why = f"a speed is zero, not a number, or beyond {FASTEST_MPS:g} m/s"
         raise DataError("plan", why, "give speed_mps in m/s, negative in reverse")
     speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_PLAN_MPS)
     # A corner is driven as a curve over one track width: the directions are averaged over this distance.
-    width = max(round(calibration.width_m / STEP_M), 1)
-    padded = np.pad(unwrapped(np.angle(step * np.sign(speed))), (width // 2, width - 1 - width // 2), mode="edge")
-    direction = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
-    held = np.abs(step / speed)
-    turn = np.append(np.diff(direction), 0.0) / held
+    corner_steps = max(round(calibration.width_m / STEP_M), 1)
+    padding = corner_steps // 2, corner_steps - 1 - corner_steps // 2
+    padded = np.pad(unwrapped(np.angle(step * np.sign(speed))), padding, mode="edge")
+    direction = np.convolve(padded, np.full(corner_steps, 1.0 / corner_steps), mode="valid")
+    duration_s = np.abs(step / speed)
+    turn = np.append(np.diff(direction), 0.0) / duration_s
     left, right = wheel_speeds(calibration.fitted, calibration.width_m, speed, turn)
-    t, distance = (np.concatenate([[0.0], np.cumsum(steps)]) for steps in (held, np.abs(step)))
+    t, distance = (np.concatenate([[0.0], np.cumsum(steps)]) for steps in (duration_s, np.abs(step)))
     left, right, turn, direction = (np.append(column, column[-1:]) for column in (left, right, turn, direction))
     planned = Track.of_states(
-        t, np.append(held, 0.0), left, right, path.real, path.imag, direction, distance
+        t, np.append(duration_s, 0.0), left, right, path.real, path.imag, direction, distance
     )._replace(gyro=turn, into=0.5)  # fmt: skip
     return _along(calibration, planned, planned, with_gyro=with_gyro)
 
 
 def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Forecast:
-    """Return the errors along the path of a recording, with its wheel speeds and, if `with_gyro`, its gyro."""
+    """Return the errors along the path of a recording, with its wheel speeds and, if `with_gyro`, its gyro.
+
+    Raises
+    ------
+    DataError
+        The path is shorter than a metre, or the calibration has no sources of error.
+    """
     return _along(calibration, recording.track, steps_of(recording), with_gyro=with_gyro)
 
 
@@ -328,36 +337,44 @@ def wheel_speeds(fitted_model: FittedModel, width_m: float, speed: Floats, turn:
 
     v, w = speed.copy(), turn.copy()
     for _ in range(INVERSIONS):
-        made = ahead_and_turn(v, w)
-        by_v = (ahead_and_turn(v + 1e-4, w) - made) / 1e-4
-        by_w = (ahead_and_turn(v, w + 1e-4) - made) / 1e-4
-        off = np.array([speed, turn]) - made
-        size = by_v[0] * by_w[1] - by_v[1] * by_w[0]
-        size = np.where(np.abs(size) > 1e-3, size, 1e-3)
-        v = v + (off[0] * by_w[1] - off[1] * by_w[0]) / size
-        w = w + (off[1] * by_v[0] - off[0] * by_v[1]) / size
+        reached = ahead_and_turn(v, w)
+        by_v = (ahead_and_turn(v + 1e-4, w) - reached) / 1e-4
+        by_w = (ahead_and_turn(v, w + 1e-4) - reached) / 1e-4
+        residual = np.array([speed, turn]) - reached
+        determinant = by_v[0] * by_w[1] - by_v[1] * by_w[0]
+        determinant = np.where(np.abs(determinant) > 1e-3, determinant, 1e-3)
+        v = v + (residual[0] * by_w[1] - residual[1] * by_w[0]) / determinant
+        w = w + (residual[1] * by_v[0] - residual[0] * by_v[1]) / determinant
     return v + w * width_m / 2.0, v - w * width_m / 2.0
 
 
 def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: bool) -> Forecast:
-    """Return the forecast after each metre of a track; `steps` is the track with joined wheel samples."""
-    metres = np.arange(1.0, np.floor(track.distance[-1]) + 1.0)
-    if not len(metres):
+    """Return the forecast after each metre of a track; `steps` is the track with joined wheel samples.
+
+    Raises
+    ------
+    DataError
+        The track is shorter than a metre, or the calibration has no sources of error.
+    """
+    horizons_m = np.arange(1.0, np.floor(track.distance[-1]) + 1.0)
+    if not len(horizons_m):
         raise DataError("path", f"is {track.distance[-1]:.2f} m long", "a forecast needs at least a metre")
-    rows = np.searchsorted(track.distance, metres)
-    windows = Windows(steps, np.zeros_like(rows), rows, metres)
+    rows = np.searchsorted(track.distance, horizons_m)
+    windows = Windows(steps, np.zeros_like(rows), rows, horizons_m)
     spread, expected, p95 = forecast_errors(calibration, windows, with_gyro=with_gyro)
     c, s = np.cos(track.heading[0]), np.sin(track.heading[0])
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
     east = np.sqrt(np.maximum(s * s * xx + 2 * c * s * xy + c * c * yy, 0.0))
     return Forecast(
-        metres, track.east[rows], track.north[rows], expected, p95, east, north,
+        horizons_m, track.east[rows], track.north[rows], expected, p95, east, north,
         np.degrees(np.sqrt(spread.heading[:, 0])),
     )  # fmt: skip
 
 
-def forecast_errors(calibration: Calibration, windows: Windows, *, with_gyro: bool) -> tuple[Spread, Floats, Floats]:
+def forecast_errors(
+    calibration: Calibration, windows: Windows, *, with_gyro: bool
+) -> tuple[ErrorMoments, Floats, Floats]:
     """Return the moments, the expected error and the 95 % error (w,) [m] in windows of a drive.
 
     Raises
@@ -366,8 +383,8 @@ def forecast_errors(calibration: Calibration, windows: Windows, *, with_gyro: bo
         The calibration has no sources of error.
     """
     fitted_model, sources = calibration.fitted, calibration.error_sources
-    if with_gyro and calibration.gyro is not None and (turned := calibration.fitted_with_gyro) is not None:
-        fitted_model, sources = turned, calibration.gyro.error_sources
+    if with_gyro and calibration.gyro is not None and (gyro_model := calibration.fitted_with_gyro) is not None:
+        fitted_model, sources = gyro_model, calibration.gyro.error_sources
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")

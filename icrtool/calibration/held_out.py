@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -147,8 +148,8 @@ class HeldOut:
         for i, (trials, recording) in enumerate(zip(self.trials, self.recordings, strict=True)):
             own_folds = [fold for fold in self.folds if fold.recording == i]
             edges = [fold.end_m for fold in own_folds[:-1]]
-            at_m = recording.track.distance[trials.starts]
-            fold_of.append(own_folds[0].number + np.searchsorted(edges, at_m, side="right"))
+            start_m = recording.track.distance[trials.starts]
+            fold_of.append(own_folds[0].number + np.searchsorted(edges, start_m, side="right"))
         first = np.searchsorted(np.concatenate(fold_of), np.arange(1, len(self.folds)))
         scores = []
         for name in self.rows:
@@ -174,8 +175,8 @@ class HeldOut:
     @property
     def rows(self) -> tuple[str, ...]:
         """The names of the rows of the table."""
-        turned = [f"{name}{GYRO_SUFFIX}" for name in HELD_OUT] if self.has_gyro else []
-        return (*HELD_OUT, *turned)
+        gyro_rows = [f"{name}{GYRO_SUFFIX}" for name in HELD_OUT] if self.has_gyro else []
+        return (*HELD_OUT, *gyro_rows)
 
     def score(self, name: str) -> HeldOutRow:
         """Return the row of this name."""
@@ -217,11 +218,11 @@ def path_between(recording: Recording, prediction: Prediction, steps: Track, sta
     `steps` is the track of the recording with joined wheel samples.
     """
     track, rows = recording.track, np.arange(start, end + 1)
-    near = steps.around(track.t[start], track.t[end])
-    turned, place = predicted_path(recording, *prediction, near)(track.t[rows])
-    turn = track.heading[start] - turned[0]
-    moved = np.exp(1j * turn) * (place - place[0])
-    return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, turned + turn)
+    span_steps = steps.around(track.t[start], track.t[end])
+    heading_rad, position = predicted_path(recording, *prediction, span_steps)(track.t[rows])
+    turn = track.heading[start] - heading_rad[0]
+    moved = np.exp(1j * turn) * (position - position[0])
+    return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, heading_rad + turn)
 
 
 def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
@@ -258,15 +259,15 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
         yield own_folds[0], np.arange(len(start_m))
         return
     block_m = own_folds[0].end_m
-    in_block = int(np.clip(block_m // STRIP_M, 1, MOST_STRIPS))
-    strip_m, last = block_m / in_block, in_block * len(own_folds) - 1
-    of_start, of_end = (np.minimum((at / strip_m).astype(np.int64), last) for at in (start_m, end_m))
-    pair = of_start * (last + 1) + of_end
+    strips_a_block = int(np.clip(block_m // STRIP_M, 1, MOST_STRIPS))
+    strip_m, last = block_m / strips_a_block, strips_a_block * len(own_folds) - 1
+    start_strip, end_strip = (np.minimum((path_m / strip_m).astype(np.int64), last) for path_m in (start_m, end_m))
+    pair = start_strip * (last + 1) + end_strip
     order = np.argsort(pair, kind="stable")
     pairs, first = np.unique(pair[order], return_index=True)
     for pair_number, rows in zip(pairs.tolist(), np.split(order, first[1:]), strict=True):
         a, b = divmod(pair_number, last + 1)
-        block = own_folds[a // in_block]
+        block = own_folds[a // strips_a_block]
         yield block._replace(begin_m=a * strip_m, end_m=(b + 1) * strip_m), rows
 
 
@@ -290,10 +291,10 @@ def errors_without(
         if (prediction := without(fold)) is not None:
             s, e = start[in_fold], end[in_fold]
             span = track.t[s.min()], track.t[e.max()]
-            near = recording.wheels(track.rows_around(*span)) if steps is None else steps.around(*span)
-            missed = trial_errors(recording, s, e, predicted_path(recording, *prediction, near))
-            for all_errors, of_fold in zip(errors, missed, strict=True):
-                all_errors[row[in_fold], column[in_fold]] = of_fold
+            span_steps = recording.wheels(track.rows_around(*span)) if steps is None else steps.around(*span)
+            fold_errors = trial_errors(recording, s, e, predicted_path(recording, *prediction, span_steps))
+            for all_errors, column_errors in zip(errors, fold_errors, strict=True):
+                all_errors[row[in_fold], column[in_fold]] = column_errors
     return errors
 
 
@@ -313,8 +314,8 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
     fits = {name: pool.fit(MODELS[name]) for name in names}
     if FIVE in fits:
         # All recordings have the clocks of one robot, so several of them show its delay no better than one.
-        off = float(np.sqrt(np.mean([recording.x_clock_std_m**2 for recording in recordings])))
-        fits[FIVE] = fits[FIVE].with_clock_error(off)
+        x_clock_std_m = float(np.sqrt(np.mean([recording.x_clock_std_m**2 for recording in recordings])))
+        fits[FIVE] = fits[FIVE].with_clock_error(x_clock_std_m)
     if all(recording.track.gyro is not None for recording in recordings):
         fits |= {f"{name}{GYRO_SUFFIX}": pool.fit(MODELS[name].with_gyro(), fits[name]) for name in names}
     return fits
@@ -358,6 +359,23 @@ def _left_out_windows(
                 yield i, Windows(steps, begin, end, windows.length_m[rows]), predicted
 
 
+class _LogErrors(NamedTuple):
+    """Errors of a model in windows of one log that it was not fitted to.
+
+    Attributes
+    ----------
+    length_m : (w,) length of each window [m]
+    moments : moments of the errors by the model
+    turn_error_rad : (w,) errors of the turn [rad]
+    error_m : complex (w,) errors of the displacement, forward + j right [m]
+    """
+
+    length_m: Floats
+    moments: error_growth.PathMoments
+    turn_error_rad: Floats
+    error_m: Complexes
+
+
 def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     """Return the sources of error of a row, from windows that the row was not fitted to; None for too few windows.
 
@@ -368,35 +386,40 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     logarithm is shrunk towards zero (James and Stein 1961), because a short drive shows its largest error and no
     quantile.
     """
-    of_logs: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
+    log_errors: list[_LogErrors] = []
     tested = [np.empty((0, 3))]
     for i, windows, (fitted_model, constants) in _left_out_windows(table, name, LENGTHS_M):
         errors = error_growth.path_errors(windows, fitted_model, table.recordings[i].width_m, constants)
         reference = np.exp(-1j * constants.heading_offset_rad) * windows.moved
-        of_logs.append((windows.length_m, errors, errors.turned - windows.turned, errors.moved - reference))
+        log_errors.append(
+            _LogErrors(windows.length_m, errors, errors.turned - windows.turned, errors.moved - reference)
+        )
         stretch = np.floor(windows.track.distance[windows.begin] / windows.length_m)
         tested.append(np.column_stack([np.full(len(stretch), i), windows.length_m, stretch]))
     stretches = Counter(np.unique(np.concatenate(tested), axis=0)[:, 1].tolist())
     measured_to_m = max(
         length_m for length_m in LENGTHS_M if length_m <= ALWAYS_TO_M or stretches[length_m] >= FEWEST_STRETCHES
     )
-    length = np.concatenate([log[0] for log in of_logs]) if of_logs else np.empty(0)
+    length = np.concatenate([log.length_m for log in log_errors]) if log_errors else np.empty(0)
     used = length <= measured_to_m
     length = length[used]
     if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_HELD_OUT_WINDOWS:
         return None
-    of_sources, of_parameters = ([getattr(log[1], part) for log in of_logs] for part in ("of_sources", "of_parameters"))
     sources, stated = (
-        error_growth.Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
-        for parts in (of_sources, of_parameters)
+        error_growth.ErrorMoments(*(np.concatenate(column)[used] for column in zip(*moments, strict=True)))
+        for moments in (
+            [log.moments.of_sources for log in log_errors],
+            [log.moments.of_parameters for log in log_errors],
+        )
     )
-    turned, missed = (np.concatenate([log[k] for log in of_logs])[used] for k in (2, 3))
-    variances = error_growth.fit_variances(length, sources, stated, turned, missed)
-    spread, far = sources.combined_moments(variances).plus(stated), length >= SCALED_FROM_M
-    error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
+    turn_error_rad = np.concatenate([log.turn_error_rad for log in log_errors])[used]
+    error_m = np.concatenate([log.error_m for log in log_errors])[used]
+    variances = error_growth.fit_variances(length, sources, stated, turn_error_rad, error_m)
+    spread, is_long = sources.combined_moments(variances).plus(stated), length >= SCALED_FROM_M
+    distance_m, count = np.abs(error_m)[is_long], max(stretches[CHOICE_HORIZON_M], 1)
     level = min(95.0 * (1.0 + 1.0 / count), 100.0)
-    share = np.percentile(error / np.maximum(error_growth.radius_of_share(spread, 0.95)[far], 1e-9), level)
-    mean = error.mean() / max(float(error_growth.mean_error(spread)[far].mean()), 1e-9)
+    share = np.percentile(distance_m / np.maximum(error_growth.radius_of_share(spread, 0.95)[is_long], 1e-9), level)
+    mean = distance_m.mean() / max(float(error_growth.mean_error(spread)[is_long].mean()), 1e-9)
     # The ratio of measured to normal error is moved towards 1, the more the fewer stretches there are.
     factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
     return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
@@ -404,23 +427,24 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
 
 def measure_controller_errors(table: HeldOut, *, has_gyro: bool) -> ControllerErrors | None:
     """Return the errors of the controller's model in each fold, fitted without this fold; None for too few windows."""
-    (far, _), (near, stretches) = (_window_errors(table, CONTROLLER, at) for at in (CHOICE_HORIZON_M, TWIST_OVER_M))
-    if min(len(far), len(near)) < FEWEST_TESTED or CHOICE_HORIZON_M not in table.horizons_m:
+    pose_errors, _ = _window_errors(table, CONTROLLER, CHOICE_HORIZON_M)
+    short_errors, stretches = _window_errors(table, CONTROLLER, TWIST_OVER_M)
+    if min(len(pose_errors), len(short_errors)) < FEWEST_TESTED or CHOICE_HORIZON_M not in table.horizons_m:
         return None
     h = table.horizons_m.index(CHOICE_HORIZON_M)
-    velocities = near[:, :3] / near[:, 3:4]
+    velocities = short_errors[:, :3] / short_errors[:, 3:4]
     turn_rate = turn_rate_std = None
     if has_gyro:
-        of_gyro, of_stretches = _window_errors(table, f"{RECOMMENDED}{GYRO_SUFFIX}", TWIST_OVER_M)
-        if len(of_gyro) >= FEWEST_TESTED:
-            squares = (of_gyro[:, 2] / of_gyro[:, 3]) ** 2
+        gyro_errors, gyro_stretches = _window_errors(table, f"{RECOMMENDED}{GYRO_SUFFIX}", TWIST_OVER_M)
+        if len(gyro_errors) >= FEWEST_TESTED:
+            squares = (gyro_errors[:, 2] / gyro_errors[:, 3]) ** 2
             turn_rate = max(float(squares.mean()), SMALLEST_VARIANCE)
-            turn_rate_std = float(squares.std()) / math.sqrt(max(of_stretches, 1))
+            turn_rate_std = float(squares.std()) / math.sqrt(max(gyro_stretches, 1))
     return ControllerErrors(
-        pose_variance=_variances(far[:, :3]),
+        pose_variance=_variances(pose_errors[:, :3]),
         twist_variance=_variances(velocities),
-        turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
-        way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
+        turn_noise=_shares(short_errors[:, 2], short_errors[:, 4], short_errors[:, 5]),
+        way_noise=_shares(np.hypot(short_errors[:, 0], short_errors[:, 1]), short_errors[:, 5], short_errors[:, 4]),
         p95_m=finite_or_none(float(table.score(CONTROLLER).together.p95[h])),
         full_p95_m=finite_or_none(float(table.score(RECOMMENDED).together.p95[h])),
         twist_variance_std=_variance_stds(velocities, stretches),

@@ -68,20 +68,20 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         )
     inputs = run.document.inputs
     left, right = (scale / error for scale, error in zip(run.wheel_scales, run.radius_errors, strict=True))
-    plain = Recording(
+    without_gyro = Recording(
         name=run.name,
         track=track_of(run),
         width_m=width,
         path=inputs[0].path if inputs else "",
         sha256=(inputs[0].sha256 or "") if inputs else "",
         begin_ns=int(run.table.stamp_ns[0]),
-        lever=Lever(*(place is not None for place in known_antenna_m(run))),
+        lever=Lever(*(coordinate_m is not None for coordinate_m in known_antenna_m(run))),
         x_clock_std_m=run.document.icr.x_clock_std_m,
         wheel_scales=(left, right),
         corrected=_corrected(run),
         heading_source=run.document.heading.source,
     )
-    return plain if heading is None else with_turn_rate(plain, heading, run.config.frames.gyro_delay_s)
+    return without_gyro if heading is None else with_turn_rate(without_gyro, heading, run.config.frames.gyro_delay_s)
 
 
 def _corrected(run: Run) -> LogConstants:
@@ -101,35 +101,37 @@ def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
     )
 
 
-def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | Literal["auto"] = "auto") -> Recording:
+def with_turn_rate(
+    without_gyro: Recording, heading: MeasuredHeading, delay_s: float | Literal["auto"] = "auto"
+) -> Recording:
     """Return a recording with the turn rate of a measured heading; without it if heading and reference disagree.
 
     Parameters
     ----------
-    plain : the recording without a turn rate
+    without_gyro : the recording without a turn rate
     heading : the measured heading
     delay_s : lag of the heading behind the wheels [s]; ``auto``: estimated from the turns of the reference
     """
     if not np.isfinite(heading.angle_rad).all():
-        return plain
-    t = plain.track.t
+        return without_gyro
+    t = without_gyro.track.t
 
     def rate(later_s: float) -> Floats:
         """Return the turn rate (n,) [rad/s] of the heading, read `later_s` after the wheels."""
         rates = np.zeros(len(t))
         for lo in range(0, len(t) - 1, ROWS_AT_ONCE):
-            at = t[lo : lo + ROWS_AT_ONCE + 1]
-            turned, dt = np.diff(np.interp(at + later_s, t, heading.angle_rad)), np.diff(at)
-            np.divide(turned, dt, out=rates[lo : lo + len(dt)], where=dt > 0.0)
+            times_s = t[lo : lo + ROWS_AT_ONCE + 1]
+            turns_rad, dt = np.diff(np.interp(times_s + later_s, t, heading.angle_rad)), np.diff(times_s)
+            np.divide(turns_rad, dt, out=rates[lo : lo + len(dt)], where=dt > 0.0)
         return rates
 
-    line = _gyro_line(plain, rate(0.0))
-    if not line.is_yaw:
-        return plain
-    later_s = line.lead_s if delay_s == "auto" else delay_s
-    track = plain.track._replace(gyro=np.sign(line.scale) * rate(later_s))
-    corrected = plain.corrected._replace(gyro_later_s=later_s)
-    return replace(plain, track=track, gyro_reversed=line.scale < 0.0, corrected=corrected)
+    gyro_fit = _fit_gyro(without_gyro, rate(0.0))
+    if not gyro_fit.is_yaw:
+        return without_gyro
+    later_s = gyro_fit.lead_s if delay_s == "auto" else delay_s
+    track = without_gyro.track._replace(gyro=np.sign(gyro_fit.scale) * rate(later_s))
+    corrected = without_gyro.corrected._replace(gyro_later_s=later_s)
+    return replace(without_gyro, track=track, gyro_reversed=gyro_fit.scale < 0.0, corrected=corrected)
 
 
 def turning_recording_of(run: Run, turn_sensor: str = "gyro", *, width_m: float | None = None) -> Recording:
@@ -142,11 +144,11 @@ def turning_recording_of(run: Run, turn_sensor: str = "gyro", *, width_m: float 
 def gyro_line(recording: Recording) -> PastLines:
     """Return scale and bias of a recording's gyro, fitted to the reference of the whole drive."""
     gyro = recording.track.gyro
-    line = GyroLine(1.0, 0.0, 0.0) if gyro is None else _gyro_line(recording, gyro)
-    return PastLines(np.zeros(1, np.int64), np.array([line.scale]), np.array([line.bias_radps]))
+    gyro_fit = GyroLine(1.0, 0.0, 0.0) if gyro is None else _fit_gyro(recording, gyro)
+    return PastLines(np.zeros(1, np.int64), np.array([gyro_fit.scale]), np.array([gyro_fit.bias_radps]))
 
 
-def _gyro_line(recording: Recording, rate: Floats) -> GyroLine:
+def _fit_gyro(recording: Recording, rate: Floats) -> GyroLine:
     """Return scale, bias and lead that map a turn rate (n,) [rad/s] to the turns of a recording's reference."""
     track = recording.track
     return fit_gyro_line(track.t, rate, track.cumulate(rate), track.t, track.heading)
@@ -204,7 +206,7 @@ def calibrate_recordings(
     turnless = ", ".join(recording.name for recording in recordings if recording.track.gyro is None)
     text = f"{turnless}: no gyro turns with the robot, so the models use the wheels alone"
     notes = (note("gyro_not_used", text),) if turnless else ()
-    calibration = calibration_from(table, robot, findings)
+    calibration = calibration_of_table(table, robot, findings)
     if grounds:
         logs = tuple(
             msgspec.structs.replace(log, ground=ground) for log, ground in zip(calibration.logs, grounds, strict=True)
@@ -214,7 +216,7 @@ def calibrate_recordings(
     return CalibrationResult(calibration, table, notes)
 
 
-def calibration_from(
+def calibration_of_table(
     table: held_out.HeldOut,
     robot: documents.CalibratedRobot | None = None,
     findings: tuple[Note, ...] = (),
@@ -235,10 +237,10 @@ def calibration_from(
     with_gyro = table.fits[f"{RECOMMENDED}{held_out.GYRO_SUFFIX}"].fitted if has_gyro else None
     logs = []
     for i, recording in enumerate(recordings):
-        constants, metres = best.constants(i), float(recording.track.distance[-1])
+        constants, distance_m = best.constants(i), float(recording.track.distance[-1])
         offset_deg, delay_s = math.degrees(constants.heading_offset_rad), -constants.wheels_later_s
         sensors = sensors_of(recording, best.pool.windows[i], best.fitted, with_gyro)
-        numbers = metres, offset_deg, delay_s, recording.begin_ns
+        numbers = distance_m, offset_deg, delay_s, recording.begin_ns
         logs.append(
             documents.CalibrationLog(recording.name, recording.path, recording.sha256, *numbers, sensors=sensors)
         )
@@ -301,9 +303,11 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
         return None
     pool = table.fits[FIVE].pool
     geometries = [Pool([windows], [width_m]).fit(MODELS[FIVE]).fitted.geometry(width_m) for windows in pool.windows]
-    place = TrackGeometry._fields.index("multiplier")
+    multiplier_index = TrackGeometry._fields.index("multiplier")
     values = np.array([geometry.multiplier for geometry, _ in geometries])
-    measured = between_variance(values, np.array([covariance[place, place] for _, covariance in geometries]))
+    measured = between_variance(
+        values, np.array([covariance[multiplier_index, multiplier_index] for _, covariance in geometries])
+    )
     variance_of_others = (MULTIPLIER_BETWEEN_SHARE * multiplier) ** 2
     return math.sqrt(pooled_variance(measured, len(values) - 1.0, variance_of_others)[0])
 
@@ -334,8 +338,8 @@ def model_for(calibration: Calibration, recording: Recording, *, with_gyro: bool
         raise ConfigError("robot.track_width_m", why, "use a calibration of this robot")
     if with_gyro and (calibration.gyro is None or recording.track.gyro is None):
         raise ConfigError("gyro", "is missing in the calibration or in the log", "use the wheels alone")
-    turned = calibration.fitted_with_gyro if with_gyro else None
-    return calibration.fitted if turned is None else turned
+    gyro_model = calibration.fitted_with_gyro if with_gyro else None
+    return calibration.fitted if gyro_model is None else gyro_model
 
 
 SAME_SHARE = 0.98
@@ -363,12 +367,12 @@ def calibrate(runs: Run | Sequence[Run] | Mapping[str, Sequence[Run]], *, allow_
         No run is left, or the runs are too short.
     """
     if isinstance(runs, Mapping):
-        grounds = [ground for ground, of_ground in runs.items() for _ in of_ground]
-        every = [run for of_ground in runs.values() for run in of_ground]
-        return calibrate_runs(every, allow_unusable=allow_unusable, grounds=grounds).calibration
+        grounds = [ground for ground, ground_runs in runs.items() for _ in ground_runs]
+        all_runs = [run for ground_runs in runs.values() for run in ground_runs]
+        return calibrate_runs(all_runs, allow_unusable=allow_unusable, grounds=grounds).calibration
     # A text is a sequence, too. As a single run, it is refused with a message about paths.
-    several = [runs] if isinstance(runs, (Run, str, PathLike)) else runs
-    return calibrate_runs(several, allow_unusable=allow_unusable).calibration
+    run_list = [runs] if isinstance(runs, (Run, str, PathLike)) else runs
+    return calibrate_runs(run_list, allow_unusable=allow_unusable).calibration
 
 
 def calibrate_runs(
@@ -381,7 +385,7 @@ def calibrate_runs(
     ground_of = iter(grounds)
     taken: list[_CalibratedRun] = []
     left_out: list[LeftOut] = []
-    alone: tuple[Note, ...] = ()
+    single_run_notes: tuple[Note, ...] = ()
     for run in runs:
         check_type(run, Run, MAKE_RUN)
         ground = next(ground_of, "")
@@ -395,7 +399,7 @@ def calibrate_runs(
         parts = [_is_part(before, candidate) for before in taken]
         left_out += [LeftOut(taken[i].recording.name, f"a part of {run.name}") for i in np.flatnonzero(parts)]
         taken = [*(before for before, is_part in zip(taken, parts, strict=True) if not is_part), candidate]
-        alone = use_notes(run)
+        single_run_notes = use_notes(run)
     recordings, robots = [log.recording for log in taken], [log.robot for log in taken]
     if not recordings:
         if not left_out:
@@ -407,7 +411,9 @@ def calibrate_runs(
         why = f"is {' and '.join(sorted(map(str, radii_m)))} in the given logs"
         advice = "fit them with the same value, because the parameters refer to it"
         raise ConfigError("robot.wheel_radius_m", why, advice)
-    notes = alone if len(taken) == 1 else tuple(dict.fromkeys(notes for log in taken for notes in log.notes))
+    notes = (
+        single_run_notes if len(taken) == 1 else tuple(dict.fromkeys(finding for log in taken for finding in log.notes))
+    )
     named = [log.ground for log in taken] if all(log.ground for log in taken) else []
     return calibrate_recordings(recordings, robots[0], notes, named)._replace(left_out=tuple(left_out))
 

@@ -209,11 +209,11 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         prior = prior_of_model(self.width_m, self.fitted, self.fitted_with_gyro, source)
         if corrected is None:
             return prior
-        wheels, turned = (
+        wheel_constants, gyro_constants = (
             remaining_constants(pooled_constants(self.logs, heading_source, with_gyro=with_gyro), corrected).usual()
             for with_gyro in (False, True)
         )
-        return replace(prior, constants=wheels, turned_constants=turned)
+        return replace(prior, constants=wheel_constants, turned_constants=gyro_constants)
 
     def fitted_to(self, sha256: str) -> bool:
         """Return whether the calibration was fitted to the log with this SHA-256."""
@@ -319,9 +319,9 @@ def parameter_documents(
 ) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
     """Return terms, parameters and covariance of a model as they are stored."""
     rows = zip(fitted_model.model.terms, fitted_model.parameters.tolist(), fitted_model.std.tolist(), strict=True)
-    unseen = fitted_model.not_shown
+    not_shown = fitted_model.not_shown
     documents_by_term = {
-        name: ParameterDocument(at, std, "not shown" if name in unseen else "shown") for name, at, std in rows
+        name: ParameterDocument(value, std, "not shown" if name in not_shown else "shown") for name, value, std in rows
     }
     return fitted_model.model.terms, documents_by_term, fitted_model.covariance.tolist()
 

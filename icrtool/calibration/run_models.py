@@ -240,7 +240,7 @@ def compare_models(
     calibration = None
     if run.track_width_m is not None:
         robot, used = pooled.robot_of(run, recording.width_m), pooled.use_notes(run)
-        calibration = pooled.calibration_from(held_out, robot, used, has_gyro=heading == "gyro")
+        calibration = pooled.calibration_of_table(held_out, robot, used, has_gyro=heading == "gyro")
     return ComparedModels(tuple(rows), held_out, recording.track, heading, tuple(notes), calibration)
 
 

@@ -49,8 +49,8 @@ Command = Callable[..., Any]
 Option = Callable[[Command], Command]
 """A decorator that adds an option to a command."""
 
-Record = TypeVar("Record")
-Change = Callable[[Record], Record]
+RecordT = TypeVar("RecordT")
+RecordChange = Callable[[RecordT], RecordT]
 """A function that returns a changed record."""
 
 REQUESTS_MODULE = "icrtool.records.requests"
@@ -100,14 +100,14 @@ class GroupedCommand(click.Command):
             for shown_option in declared
             if (help_record := shown_option.get_help_record(ctx)) is not None
         ]
-        places = {f"--{name}": place for place, name in enumerate(USUAL_OPTIONS)}
+        ranks = {f"--{name}": rank for rank, name in enumerate(USUAL_OPTIONS)}
 
-        def rank(parameter: click.Parameter) -> int | None:
+        def rank_of(parameter: click.Parameter) -> int | None:
             """Return the place of an option among the usual options; None for another option."""
-            return next((places[name] for name in parameter.opts if name in places), None)
+            return next((ranks[name] for name in parameter.opts if name in ranks), None)
 
-        usual = sorted((pair for pair in shown if rank(pair[0]) is not None), key=lambda pair: rank(pair[0]) or 0)
-        rest = [pair for pair in shown if rank(pair[0]) is None]
+        usual = sorted((pair for pair in shown if rank_of(pair[0]) is not None), key=lambda pair: rank_of(pair[0]) or 0)
+        rest = [pair for pair in shown if rank_of(pair[0]) is None]
         for title, pairs in (("Options", usual), ("More options", rest)):
             with formatter.section(title):
                 formatter.write_dl([help_record for _, help_record in pairs])

@@ -16,8 +16,8 @@ from icrtool.cli.options import (
     FILE,
     NOT_NEGATIVE,
     POSITIVE,
-    Change,
     Option,
+    RecordChange,
     choice,
     flag,
     numbers_reader,
@@ -191,10 +191,10 @@ def drive_options(*further: Option, **defaults: object) -> Option:
 @options.CONFIGURATION
 @options.printer_options(options.QUIET, options.VERBOSE_OPTION)
 def simulate_command(
-    log: Path, force: bool, seed: int, speeds: Path | None, path: Change[PathPlan], plan: Change[DrivePlan],
-    sensors: Change[Sensors], encoder_counts: float | None, wheel_rate: float | None, antenna: tuple[float, float],
-    wheel_messages: WheelMessages, convention: HeadingConvention, contacts: Change[FrictionRobot], dynamics: bool,
-    tracks: bool, settings: ConfigSources, printer: Printer,
+    log: Path, force: bool, seed: int, speeds: Path | None, path: RecordChange[PathPlan], plan: RecordChange[DrivePlan],
+    sensors: RecordChange[Sensors], encoder_counts: float | None, wheel_rate: float | None,
+    antenna: tuple[float, float], wheel_messages: WheelMessages, convention: HeadingConvention,
+    contacts: RecordChange[FrictionRobot], dynamics: bool, tracks: bool, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Drive a robot of known ICRs, and write the log that its sensors would record and the true states.
 
@@ -248,7 +248,7 @@ def simulate_command(
 
 
 def friction_robot(
-    contacts: Change[FrictionRobot], config: Config, *, dynamics: bool, tracks: bool
+    contacts: RecordChange[FrictionRobot], config: Config, *, dynamics: bool, tracks: bool
 ) -> FrictionRobot | None:
     """Return the robot on sliding contacts with the configured track width; None without --dynamics."""
     if not dynamics:
@@ -320,9 +320,10 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
 @options.CONFIGURATION
 @options.printer_options(options.QUIET, options.VERBOSE_OPTION)
 def study_command(
-    name: str, output: Path | None, request: Change[StudyRequest], preset: PresetName | None,
-    path: Change[PathPlan], plan: Change[DrivePlan], sensors: Change[Sensors], encoder_counts: float | None,
-    contacts: Change[FrictionRobot], dynamics: bool, tracks: bool, rate: float | None, plots: tuple[str, ...],
+    name: str, output: Path | None, request: RecordChange[StudyRequest], preset: PresetName | None,
+    path: RecordChange[PathPlan], plan: RecordChange[DrivePlan], sensors: RecordChange[Sensors],
+    encoder_counts: float | None, contacts: RecordChange[FrictionRobot], dynamics: bool, tracks: bool,
+    rate: float | None, plots: tuple[str, ...],
     settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Simulate and filter many drives; report accuracy, convergence time and consistency of the ICRs.

@@ -374,11 +374,13 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
             )
             # A bound that stays within the budget at every horizon with an interval has no distance.
             low, high, next_low, next_high = (None if end is None or end[1] else end[0] for end in ends)
-            quiet = documents.column_of(result.without_events, "p95_m")
-            free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
-            without = (None, False) if free is None else free[:2]
+            without_events_p95_m = documents.column_of(result.without_events, "p95_m")
+            without_events_reach = None
+            if len(without_events_p95_m):
+                without_events_reach = within_budget(report.horizons_m, without_events_p95_m, budget_m)
+            without_events = (None, False) if without_events_reach is None else without_events_reach[:2]
             ends_m = low, high, next_low, next_high
-            distances.append(BudgetDistance(result.name, budget_m, *reached, *ends_m, *without))
+            distances.append(BudgetDistance(result.name, budget_m, *reached, *ends_m, *without_events))
     return tuple(distances)
 
 

@@ -99,30 +99,30 @@ def measure_errors(
     predictors = _predictors(models if models is not None else models_of(run), further)
     standing, learned = standing_states(track), first_learned(run)
     sparse = starts_of_further if starts_of_further is not None else _sparse_starts(standing)
-    sparse_errors = _errors_of_few(track, predictors, Trials(sparse, counted_ends(track, horizons, starts, sparse)))
+    sparse_errors = _sparse_errors(track, predictors, Trials(sparse, counted_ends(track, horizons, starts, sparse)))
     by_model: list[list[_AtHorizon]] = [[] for _ in predictors]
     counts, drawn = list[TrialCounts](), list[list[DrawnTrials]]()
     before, after = list[documents.ErrorRow](), list[documents.ErrorRow]()
     at_once = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
     with ThreadPoolExecutor(TRIAL_THREADS) as pool:
         # For a long log, horizons are computed one after the other, because all columns together would fill the memory.
-        each = pool.map if at_once > TRIAL_THREADS else map
+        map_horizons = pool.map if at_once > TRIAL_THREADS else map
         for columns in [slice(begin, begin + at_once) for begin in range(0, len(horizons), at_once)]:
             group, ends = horizons[columns], counted_ends(track, horizons[columns], starts).T
             trials = _StartedTrials.from_all_states(run, track, group, ends)
-            for number, (model, of_few, rows) in enumerate(
+            for number, (model, row_sparse_errors, rows) in enumerate(
                 zip(predictors, sparse_errors, by_model, strict=True), start=1
             ):
                 watch(f"errors, row {number} of {len(predictors)}")
                 if is_compared := isinstance(model, ComparedRow):
-                    errors = of_few.position[:, columns]
+                    errors = row_sparse_errors.position[:, columns]
                     tried = trials.from_starts(sparse, group, errors)
                 else:
                     errors, tried = _errors(track, model, ends, pool), trials
-                rows.extend(_statistics(model, group, errors, of_few, columns, tried, each))
+                rows.extend(_statistics(model, group, errors, row_sparse_errors, columns, tried, map_horizons))
                 if model.name == "icr":
-                    before += each(_row, group.tolist(), errors[:learned].T)
-                    after += each(_row, group.tolist(), errors[len(errors) if learned is None else learned :].T)
+                    before += map_horizons(_row, group.tolist(), errors[:learned].T)
+                    after += map_horizons(_row, group.tolist(), errors[len(errors) if learned is None else learned :].T)
                 if sink is not None:
                     sink(model.name, group, _at_all_starts(errors, sparse, len(run.table)) if is_compared else errors)
                 del errors, tried  # The memory is freed before the next model.
@@ -156,9 +156,9 @@ def _sparse_starts(standing: Bools) -> Ints:
 
 def _at_all_starts(errors: Floats, starts: Ints, states: int) -> Floats:
     """Return the errors (k, h) of starts (k,) as an array (n, h) of all states; NaN in the other rows."""
-    whole = np.full((states, errors.shape[1]), np.nan)
-    whole[starts] = errors
-    return whole
+    all_errors = np.full((states, errors.shape[1]), np.nan)
+    all_errors[starts] = errors
+    return all_errors
 
 
 def _by_learning(
@@ -202,24 +202,26 @@ class _StartedTrials(NamedTuple):
 
 
 def _statistics(
-    model: Model | ComparedRow, horizons_m: Floats, errors: Floats, of_few: TrialErrors, columns: slice,
-    trials: _StartedTrials, each: Callable[..., Iterable[_AtHorizon]],
+    model: Model | ComparedRow, horizons_m: Floats, errors: Floats, sparse_errors: TrialErrors, columns: slice,
+    trials: _StartedTrials, map_horizons: Callable[..., Iterable[_AtHorizon]],
 ) -> Iterable[_AtHorizon]:  # fmt: skip
     """Return the statistics of a model's errors (n, h) at each horizon.
 
     Parameters
     ----------
-    of_few : errors of the turns, and errors with aligned start headings, in fewer trials at all horizons
-    columns : columns of `of_few` with the horizons of `errors`
+    sparse_errors : errors of the turns, and errors with aligned start headings, in fewer trials at all horizons
+    columns : columns of `sparse_errors` with the horizons of `errors`
     trials : the trials
-    each : applies a function to each horizon, as `map` does
+    map_horizons : applies a function to each horizon, as `map` does
     """
-    turned, aligned = of_few.heading.T[columns], of_few.aligned.T[columns]
-    at_each = partial(_at_horizon, row_of(model.name).spread)
-    return each(at_each, horizons_m.tolist(), errors.T, turned, aligned, trials.blocks, trials.slipping)
+    turn_errors, aligned = sparse_errors.heading.T[columns], sparse_errors.aligned.T[columns]
+    statistics_of_horizon = partial(_at_horizon, row_of(model.name).spread)
+    return map_horizons(
+        statistics_of_horizon, horizons_m.tolist(), errors.T, turn_errors, aligned, trials.blocks, trials.slipping
+    )
 
 
-def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], trials: Trials) -> list[TrialErrors]:
+def _sparse_errors(track: Track, predictors: Sequence[Model | ComparedRow], trials: Trials) -> list[TrialErrors]:
     """Return the errors (k, h) of each model in some trials; the filter's models have only heading errors.
 
     All horizons are computed at once, so that a model drives the log only once. The errors are computed before the
@@ -235,12 +237,12 @@ def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], tria
 
 
 class _AtHorizon(NamedTuple):
-    """Statistics of the errors of one model at one horizon; `free` is of the trials that touch no slip event."""
+    """Statistics of the errors of one model at one horizon; `without_events`: of trials without slip event."""
 
     row: documents.SummaryRow
     bins: statistics.Histogram
     sums: statistics.BlockSums | None
-    free: documents.ErrorRow | None
+    without_events: documents.ErrorRow | None
     aligned: documents.AlignedErrors | None
 
 
@@ -258,10 +260,12 @@ def _turn_errors(track: Track, icrs: FrozenIcrs, trials: Trials) -> Floats:
     np.subtract(track.v_left, track.v_right, out=turn[1:])
     turn[1:] *= track.held
     np.cumsum(turn, out=turn)
-    at = trials.starts if len(icrs.y_icr_right) > 1 else np.zeros(1, np.int64)
-    width = np.maximum(np.abs(icrs.y_icr_right[at] - icrs.y_icr_left[at]), MIN_ICR_SEPARATION_M)
-    made, driven = (column[trials.ends] - column[trials.starts][:, None] for column in (turn, track.heading))
-    errors: Floats = np.abs(made / width[:, None] - driven)
+    icr_rows = trials.starts if len(icrs.y_icr_right) > 1 else np.zeros(1, np.int64)
+    width = np.maximum(np.abs(icrs.y_icr_right[icr_rows] - icrs.y_icr_left[icr_rows]), MIN_ICR_SEPARATION_M)
+    turn_by_icrs, turn_of_reference = (
+        column[trials.ends] - column[trials.starts][:, None] for column in (turn, track.heading)
+    )
+    errors: Floats = np.abs(turn_by_icrs / width[:, None] - turn_of_reference)
     errors[trials.ends < 0] = np.nan
     return errors
 
@@ -302,17 +306,17 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
     return horizons
 
 
-def _row(metres: float, errors: Floats) -> documents.ErrorRow:
+def _row(horizon_m: float, errors: Floats) -> documents.ErrorRow:
     """Return the statistics of errors (n,) [m] at one horizon [m]."""
     trials, *numbers = statistics.RankedTrials.from_errors(errors).summary()
-    return documents.ErrorRow(metres, trials, *map(finite_or_none, numbers))
+    return documents.ErrorRow(horizon_m, trials, *map(finite_or_none, numbers))
 
 
-def _blocks(path_m: Floats, horizons: Floats, tried: Iterable[Bools]) -> list[statistics.Blocks | None]:
-    """Return the blocks of path of each horizon; `tried` has for each horizon the starts (n,) with a trial."""
+def _blocks(path_m: Floats, horizons: Floats, has_trials: Iterable[Bools]) -> list[statistics.Blocks | None]:
+    """Return the blocks of path of each horizon; `has_trials` has for each horizon the starts (n,) with a trial."""
     return [
-        statistics.cut_blocks(has_trial, path_m, metres)
-        for has_trial, metres in zip(tried, horizons.tolist(), strict=True)
+        statistics.cut_blocks(has_trial, path_m, horizon_m)
+        for has_trial, horizon_m in zip(has_trials, horizons.tolist(), strict=True)
     ]
 
 
@@ -328,7 +332,7 @@ def _errors(track: Track, model: Model, ends: Rows, pool: Executor) -> Floats:
 
 
 def _at_horizon(
-    spread: statistics.Spread, metres: float, errors: Floats, turned: Floats, aligned: Floats,
+    spread: statistics.Spread, horizon_m: float, errors: Floats, turn_errors: Floats, aligned: Floats,
     blocks: statistics.Blocks | None, slipping: Bools | None,
 ) -> _AtHorizon:  # fmt: skip
     """Return the statistics of one model at one horizon.
@@ -336,8 +340,8 @@ def _at_horizon(
     Parameters
     ----------
     spread : spread of the errors between drives, from other drives
-    metres : the horizon [m]
-    errors : (n,) [m]; turned : (k,) errors of the turns [rad]
+    horizon_m : the horizon [m]
+    errors : (n,) [m]; turn_errors : (k,) errors of the turns [rad]
     aligned : (n,) errors with aligned start headings [m]; empty for the filter's models
     blocks : blocks of path of the trials
     slipping : (n,) whether a trial touches a slip event
@@ -350,12 +354,12 @@ def _at_horizon(
     sums = statistics.block_sums(errors, blocks, ranked, p50, p95)
     del ranked  # A column of the log is freed before the intervals need a column of the same size.
     intervals = statistics.error_intervals(errors, blocks, sums, p50, p95, spread)
-    _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.from_errors(np.degrees(turned)).summary()
-    shares = 100.0 * expected / metres, 100.0 * p95 / metres
+    _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.from_errors(np.degrees(turn_errors)).summary()
+    shares = 100.0 * expected / horizon_m, 100.0 * p95 / horizon_m
     numbers = (expected, p50, p95, largest, *shares, *intervals, turn_mean, turn_p95)
-    row = documents.SummaryRow(metres, trials, *(finite_or_none(float(number)) for number in numbers))
-    free = None if slipping is None else _row(metres, errors[~slipping])
-    return _AtHorizon(row, bins, sums, free, _aligned(aligned, blocks))
+    row = documents.SummaryRow(horizon_m, trials, *(finite_or_none(float(number)) for number in numbers))
+    without_events = None if slipping is None else _row(horizon_m, errors[~slipping])
+    return _AtHorizon(row, bins, sums, without_events, _aligned(aligned, blocks))
 
 
 def _aligned(errors: Floats, blocks: statistics.Blocks | None) -> documents.AlignedErrors | None:
@@ -369,7 +373,7 @@ def _aligned(errors: Floats, blocks: statistics.Blocks | None) -> documents.Alig
 
 def _result(model: Model | ComparedRow, by_horizon: Iterable[_AtHorizon]) -> documents.ModelResult:
     """Return the result of a model from its statistics at each horizon."""
-    rows, bins, sums, free, aligned = zip(*by_horizon, strict=True)
+    rows, bins, sums, without_events, aligned = zip(*by_horizon, strict=True)
     blocks = []
     for row, sums_of_row in zip(rows, sums, strict=True):
         if sums_of_row is not None:
@@ -377,6 +381,8 @@ def _result(model: Model | ComparedRow, by_horizon: Iterable[_AtHorizon]) -> doc
             blocks.append(
                 documents.BlocksDocument(row.horizon_m, **plain_value(sums_of_row._asdict() | {"errors_m": errors_m}))
             )
-    of_name = row_of(model.name)
-    document = documents.ModelDocument(model.name, of_name.words, model.knows or of_name.knows, list(rows), blocks)
-    return documents.ModelResult(document, bins, sums, tuple(row for row in free if row is not None), aligned)
+    report_row = row_of(model.name)
+    document = documents.ModelDocument(
+        model.name, report_row.words, model.knows or report_row.knows, list(rows), blocks
+    )
+    return documents.ModelResult(document, bins, sums, tuple(row for row in without_events if row is not None), aligned)

@@ -255,8 +255,8 @@ class PooledFit(FittedModel):
     def with_clock_error(self, x_std_m: float) -> PooledFit:
         """Return the fit with a further standard deviation of its x_icr [m], which is -vy_w b / (2 omega_w)."""
         by_term = dict(zip(self.model.terms, self.parameters.tolist(), strict=True))
-        place, covariance = self.model.terms.index("vy_w"), self.covariance.copy()
-        covariance[place, place] += (2.0 * by_term["omega_w"] / self.pool.widths_m[0] * x_std_m) ** 2
+        vy_w_index, covariance = self.model.terms.index("vy_w"), self.covariance.copy()
+        covariance[vy_w_index, vy_w_index] += (2.0 * by_term["omega_w"] / self.pool.widths_m[0] * x_std_m) ** 2
         return replace(self, covariance=covariance)
 
     def constants(self, recording: int) -> LogConstants:
@@ -290,10 +290,12 @@ class PooledFit(FittedModel):
             covariance = self._covariance(np.linalg.inv(refit.curvature)[:k, :k])
             fitted_model = replace(refit.fitted, covariance=covariance)
             return fitted_model, own_constants(pool.windows[i], fitted_model, pool.widths_m[i])
-        of_wheels = None if self.wheels is None else self.wheels.fit_without(fold)
-        wheels = None if of_wheels is None else of_wheels[0]
-        shown = None if self.wide is None else self.wide.fit_without(fold)
-        model = self.model if shown is None else replace(self.model, stds=()).with_shown_priors(shown[0])
+        wheels_prediction = None if self.wheels is None else self.wheels.fit_without(fold)
+        wheels = None if wheels_prediction is None else wheels_prediction[0]
+        wide_prediction = None if self.wide is None else self.wide.fit_without(fold)
+        model = self.model
+        if wide_prediction is not None:
+            model = replace(self.model, stds=()).with_shown_priors(wide_prediction[0])
         if fold.whole:
             gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
             # The priors may be different without the recording.
@@ -439,21 +441,22 @@ def _fit_constants(
     windows: Windows, fitted_model: FittedModel, width_m: float, known: Floats, overlap: float
 ) -> tuple[Floats, RobustFit]:
     """Return all constants (c,), and the fit of those that are NaN in `known` (c,); `overlap` as in `Linearised`."""
-    of_both, free = residuals_of(windows, fitted_model.model, width_m, fitted_model.wheels), np.isnan(known)
-    std = constant_std(fitted_model.model)[free]
+    joint_residuals = residuals_of(windows, fitted_model.model, width_m, fitted_model.wheels)
+    is_estimated = np.isnan(known)
+    std = constant_std(fitted_model.model)[is_estimated]
 
-    def whole(values: Floats) -> Floats:
+    def all_constants(values: Floats) -> Floats:
         constants = known.copy()
-        constants[free] = values
+        constants[is_estimated] = values
         return constants
 
     def evaluate(values: Floats) -> tuple[Floats, Floats]:
-        residuals, by = of_both(fitted_model.parameters, whole(values))
-        return residuals, by[:, len(fitted_model.parameters) :][:, free]
+        residuals, jacobian = joint_residuals(fitted_model.parameters, all_constants(values))
+        return residuals, jacobian[:, len(fitted_model.parameters) :][:, is_estimated]
 
     zero, kind = np.zeros(len(std)), np.repeat(RESIDUAL_KINDS, len(windows.begin))
     fit = robust_least_squares(evaluate, zero, zero, std, kind=kind, overlap=overlap)
-    return whole(fit.x), fit
+    return all_constants(fit.x), fit
 
 
 class Pool:

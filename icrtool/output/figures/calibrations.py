@@ -64,25 +64,27 @@ def forecast_figure(
     sheet = new_sheet(
         answer, f"{title}: forecast from the start without GNSS, {by}", ax, margins_in=margins_in, **layout
     )
-    grown, path = sheet.subplots(1, 2)[0]
+    error_axes, path_axes = sheet.subplots(1, 2)[0]
     for drawn, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
         if drawn is not None:
-            grown.plot(drawn.distance_m, drawn.p95_m, label=f"95 %{words}", **style.ICR | {"linestyle": "-"} | dash)
-            grown.plot(drawn.distance_m, drawn.expected_m, label=f"expected{words}", **style.FILTER | dash)
+            error_axes.plot(
+                drawn.distance_m, drawn.p95_m, label=f"95 %{words}", **style.ICR | {"linestyle": "-"} | dash
+            )
+            error_axes.plot(drawn.distance_m, drawn.expected_m, label=f"expected{words}", **style.FILTER | dash)
     for budget in budgets_m:
-        grown.axhline(budget, label=f"budget {budget:g} m", **style.BUDGET)
+        error_axes.axhline(budget, label=f"budget {budget:g} m", **style.BUDGET)
     if total_m > measured_m:
-        grown.axvspan(measured_m, total_m, label=f"beyond {measured_m:g} m: not measured", **BEYOND_LOOK)
-    grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, total_m), ylim=(0.0, None))
+        error_axes.axvspan(measured_m, total_m, label=f"beyond {measured_m:g} m: not measured", **BEYOND_LOOK)
+    error_axes.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, total_m), ylim=(0.0, None))
     if reached is not None and not reached[1]:
-        grown.plot([reached[0]], [budgets_m[0]], zorder=5, **style.spot_look("black", 4.5))
+        error_axes.plot([reached[0]], [budgets_m[0]], zorder=5, **style.spot_look("black", 4.5))
         look: style.Look = {"ha": "right", "va": "bottom", "fontsize": 8.5}
-        style.write_near(grown, f"{reached[0]:.1f} m", (reached[0], budgets_m[0]), (-3.0, 4.0), **look)
-    path.plot(forecast.east_m, forecast.north_m, label="path", **style.HALF_WIDTH | {"linestyle": "-"})
-    _draw_error_circles(path, forecast, min(measured_m, total_m))
-    path.autoscale_view()
-    path.set_aspect("equal", adjustable="datalim")
-    name_directions(path, document)
+        style.write_near(error_axes, f"{reached[0]:.1f} m", (reached[0], budgets_m[0]), (-3.0, 4.0), **look)
+    path_axes.plot(forecast.east_m, forecast.north_m, label="path", **style.HALF_WIDTH | {"linestyle": "-"})
+    _draw_error_circles(path_axes, forecast, min(measured_m, total_m))
+    path_axes.autoscale_view()
+    path_axes.set_aspect("equal", adjustable="datalim")
+    name_directions(path_axes, document)
     sheet.legend(ncols=FORECAST_KEY_COLUMNS)
     return sheet.finish()
 
@@ -93,24 +95,24 @@ def _draw_error_circles(axes: Axes, forecast: Forecast, last_m: float) -> None:
     rows = np.flatnonzero(forecast.distance_m <= last_m)
     rows = rows[np.isclose(np.round(forecast.distance_m[rows] / step_m) * step_m, forecast.distance_m[rows])]
     blue = style.ICR["color"]
-    at = [(float(forecast.east_m[row]), float(forecast.north_m[row])) for row in rows]
+    positions = [(float(forecast.east_m[row]), float(forecast.north_m[row])) for row in rows]
     # The largest circle is drawn first, below the others.
-    for place, row in sorted(zip(at, rows, strict=True), key=lambda circle: -forecast.p95_m[circle[1]]):
+    for position, row in sorted(zip(positions, rows, strict=True), key=lambda circle: -forecast.p95_m[circle[1]]):
         radius = float(forecast.p95_m[row])
-        axes.add_patch(Circle(place, radius, facecolor=blue, alpha=0.13, linewidth=0, zorder=1.5))
-        axes.add_patch(Circle(place, radius, fill=False, edgecolor=blue, linewidth=1.0, zorder=2.5))
+        axes.add_patch(Circle(position, radius, facecolor=blue, alpha=0.13, linewidth=0, zorder=1.5))
+        axes.add_patch(Circle(position, radius, fill=False, edgecolor=blue, linewidth=1.0, zorder=2.5))
     axes.plot([], [], label="95 % of the errors by wheels", color=blue, linewidth=1.0)
-    begin: style.Look = style.spot_look("white") | {"label": "start", "zorder": 4}
-    axes.plot([forecast.east_m[0]], [forecast.north_m[0]], **begin)
-    if at:
-        axes.plot(*zip(*at, strict=True), zorder=4, **style.spot_look("black", 3.0))
+    start_look: style.Look = style.spot_look("white") | {"label": "start", "zorder": 4}
+    axes.plot([forecast.east_m[0]], [forecast.north_m[0]], **start_look)
+    if positions:
+        axes.plot(*zip(*positions, strict=True), zorder=4, **style.spot_look("black", 3.0))
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
     labels = [
-        Label(f"{forecast.distance_m[row]:g} m: {error_text(float(forecast.p95_m[row]))}", *place)
-        for place, row in zip(at, rows, strict=True)
+        Label(f"{forecast.distance_m[row]:g} m: {error_text(float(forecast.p95_m[row]))}", *position)
+        for position, row in zip(positions, rows, strict=True)
     ]
-    write_labels(axes, labels, [(forecast.east_m, forecast.north_m)], crossing=True, marks=at)
+    write_labels(axes, labels, [(forecast.east_m, forecast.north_m)], crossing=True, marks=positions)
 
 
 SHARES_PCT = (50.0, 95.0)
@@ -217,10 +219,10 @@ def transfer(comparison: GroupComparison, *, ax: Axes | None = None) -> Figure |
     sheet = new_sheet(
         _comparison_title(comparison), f"{names}: 95 % errors by wheels alone, with 95 % intervals", ax, **layout
     )
-    cost_axes, difference_axes = sheet.subplots(2, 1, height_ratios=heights)[:, 0]
-    _draw_forest(cost_axes, errors)
-    cost_axes.set(xlabel="Error [m]", xlim=(0.0, None))
-    cost_axes.set_title(f"95 % error after {CHOICE_HORIZON_M:g} m", loc="left", pad=5.0)
+    errors_axes, difference_axes = sheet.subplots(2, 1, height_ratios=heights)[:, 0]
+    _draw_forest(errors_axes, errors)
+    errors_axes.set(xlabel="Error [m]", xlim=(0.0, None))
+    errors_axes.set_title(f"95 % error after {CHOICE_HORIZON_M:g} m", loc="left", pad=5.0)
     _draw_forest(difference_axes, rows, about_zero=True)
     difference_axes.set_xlabel("Difference of the 95 % error [m]")
     difference_axes.set_title("Differences: right of 0 is a larger error", loc="left", pad=5.0)
@@ -234,11 +236,15 @@ def _group(name: str) -> str:
 
 def _comparison_title(comparison: GroupComparison) -> str:
     """Return the largest difference of two groups after `CHOICE_HORIZON_M`, and whether it may be chance."""
-    at = [(pair, error) for pair in comparison.pairs for error in pair.errors if error.horizon_m == CHOICE_HORIZON_M]
-    with_cost = [(pair, error.p95_m, error) for pair, error in at if error.p95_m is not None]
-    if not with_cost:
+    with_error = [
+        (pair, error.p95_m, error)
+        for pair in comparison.pairs
+        for error in pair.errors
+        if error.horizon_m == CHOICE_HORIZON_M and error.p95_m is not None
+    ]
+    if not with_error:
         return f"No two groups have trials of {CHOICE_HORIZON_M:g} m to compare"
-    pair, value_m, error = max(with_cost, key=lambda each: abs(each[1]))
+    pair, value_m, error = max(with_error, key=lambda pair_error: abs(pair_error[1]))
     at_m = f"at {CHOICE_HORIZON_M:g} m"
     if error.p95_low_m is None or error.p95_high_m is None:
         return f"{_group(pair.second)}: {signed_text(value_m, 2)} m against {_group(pair.first)} {at_m}, no interval"
@@ -413,6 +419,14 @@ def _draw_over_dates(sheet: Sheet, points: Sequence[FleetLog]) -> None:
     panels[-1].set_xlabel(f"Date, UTC, {' to '.join(dict.fromkeys((years[0], years[-1])))}")
 
 
+class LogError(NamedTuple):
+    """The 95 % error of a log of a group after 10 m [m]."""
+
+    group: str
+    log: str
+    p95_m: float
+
+
 @styled
 def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axes:
     """Return the figure of the 95 % error after 10 m [m] of every log by group; of many logs the largest errors.
@@ -420,33 +434,33 @@ def fleet_errors(fleet: FleetNumbers, *, ax: Axes | None = None) -> Figure | Axe
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
     errors = [
-        (group, log, error)
+        LogError(group, log, error)
         for group, logs in fleet.errors_m.items()
         for log, error in sorted(logs.items(), key=lambda named_error: -named_error[1])
     ]
-    largest = sorted(errors, key=lambda log_error: -log_error[2])[:MOST_CALENDAR_ROWS]
-    robots = [log_error for log_error in errors if log_error in largest]
+    largest = sorted(errors, key=lambda log_error: -log_error.p95_m)[:MOST_CALENDAR_ROWS]
+    shown_errors = [log_error for log_error in errors if log_error in largest]
     cut = f", the {MOST_CALENDAR_ROWS} largest" if len(errors) > MOST_CALENDAR_ROWS else ""
-    median = error_text(float(np.median([error for *_, error in errors])))
-    labels = [_dated(log, fleet.starts_utc.get(log, "")) for _, log, _ in robots]
+    median = error_text(float(np.median([error for _, _, error in errors])))
+    labels = [_dated(log, fleet.starts_utc.get(log, "")) for _, log, _ in shown_errors]
     title = f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}"
     known = ", with its 95 % interval" if fleet.intervals_m else ""
     subtitle = f"{fleet.title}: 95 % error after 10 m without GNSS{known}, {fleet.model}{cut}"
-    height_in = 1.85 + ROW_IN * len(robots)
+    height_in = 1.85 + ROW_IN * len(shown_errors)
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=(3.1, 0.7, 0.65, 1.0))
     axes = sheet.subplots()[0, 0]
     axes.set_yticks(range(len(labels)), labels, parse_math=False)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     for (group, logs), look in zip(fleet.errors_m.items(), cycle(GROUP_LOOKS), strict=False):
-        rows = [row for row, robot in enumerate(robots) if robot[0] == group]
+        rows = [row for row, log_error in enumerate(shown_errors) if log_error.group == group]
         middle = error_text(float(np.median(list(logs.values()))))
         label = f" {style.drawable_text(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
-        axes.plot([robots[row][2] for row in rows], rows, markersize=5.5, label=label, zorder=3, **look)
+        axes.plot([shown_errors[row].p95_m for row in rows], rows, markersize=5.5, label=label, zorder=3, **look)
         for row in rows:
-            if (ends := fleet.intervals_m.get(robots[row][1])) is not None:
+            if (ends := fleet.intervals_m.get(shown_errors[row].log)) is not None:
                 axes.plot(ends, [row, row], color=look["color"], linewidth=1.4, marker="|", markersize=6.0)
     centred: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False}
-    for row, (_, log, error) in enumerate(robots):
+    for row, (_, log, error) in enumerate(shown_errors):
         last = fleet.intervals_m.get(log, (error, error))[1]
         style.write_near(axes, error_text(error), (last, row), (6.0, 0.0), **centred)
     style.logarithmic_errors(axes)

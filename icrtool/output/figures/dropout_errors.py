@@ -198,25 +198,25 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float, ax: Axes | Non
 
     `ax`: axes to draw into, which are returned; by default the picture is a new figure.
     """
-    numbers = [_place(report, metres) for metres in horizons_m]
-    of_models = (
-        (result, [h for h in numbers if len(result.histograms[h].left)])
+    horizon_indices = [_horizon_index(report, horizon_m) for horizon_m in horizons_m]
+    drawable = (
+        (result, [h for h in horizon_indices if len(result.histograms[h].left)])
         for result in (*_models(report), *report.results)
     )
-    model, places = next(drawn for drawn in of_models if drawn[1])
+    model, shown_horizons = next(drawn for drawn in drawable if drawn[1])
     budgets_m = dict.fromkeys(reach.budget_m for reach in report.document.budgets)
-    errors = ", ".join(error_text(model.document.by_horizon[h].p95_m).removesuffix(" m") for h in places)
-    distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
+    errors = ", ".join(error_text(model.document.by_horizon[h].p95_m).removesuffix(" m") for h in shown_horizons)
+    distances = ", ".join(f"{report.horizons_m[h]:g}" for h in shown_horizons)
     title = f"95 % of the trials end within {errors} m after {distances} m"
     subtitle = f"{run_title(report.run_document)}: open-loop error of {model.name} ({model.document.words})"
-    height_in, margins_in = 1.55 + LOW_PANEL_IN * len(places), (0.75, 0.25, 0.85, 0.9)
+    height_in, margins_in = 1.55 + LOW_PANEL_IN * len(shown_horizons), (0.75, 0.25, 0.85, 0.9)
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=margins_in, hspace=0.38)
-    panels = sheet.subplots(len(places), 1, sharex=True)[:, 0]
-    p95 = model.column("p95_m")[places]
+    panels = sheet.subplots(len(shown_horizons), 1, sharex=True)[:, 0]
+    p95 = model.column("p95_m")[shown_horizons]
     end = LEAST_HISTOGRAM_IN_P95 * max(
         [np.nanmax(p95), *(budget_m for budget_m in budgets_m if budget_m < 2 * np.nanmax(p95))]
     )
-    for axes, h in zip(panels, places, strict=True):
+    for axes, h in zip(panels, shown_horizons, strict=True):
         heading = f"after {report.horizons_m[h]:g} m, {model.document.by_horizon[h].trials:,} trials"
         _draw_bins(axes, model, h, _pens(report)[model.name]["color"], end, heading)
         for budget in budgets_m:
@@ -237,7 +237,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float, *, ax: Axes | Non
     ValueError
         The report has no such horizon.
     """
-    h = _place(report, horizon_m)
+    h = _horizon_index(report, horizon_m)
     # A model of constant parameters may have no trial of a length for which other models have one.
     results = [result for result in _pictured(report) if len(result.histograms[h].left)]
     p95 = [float(result.column("p95_m")[h]) for result in results]
@@ -276,7 +276,7 @@ def _pens(report: DropoutReport) -> dict[str, style.Look]:
     return style.row_pens(result.name for result in report.results)
 
 
-def _place(report: DropoutReport, horizon_m: float) -> int:
+def _horizon_index(report: DropoutReport, horizon_m: float) -> int:
     """Return the index of a horizon [m] of a report."""
     if horizon_m not in report.horizons_m:
         raise ValueError(f"horizon_m: {horizon_m:g} m is not among the report's horizons")

@@ -246,12 +246,12 @@ class _Store:
         OutputError
             Another command is writing there.
         """
-        stated, time_s = writer_id(), f"{time.time():.0f}"
-        claim = f"{stated} {time_s}".encode()
+        writer, time_s = writer_id(), f"{time.time():.0f}"
+        claim = f"{writer} {time_s}".encode()
         if self._is_conditional:
             self._write_claim(claim)
         else:
-            with self._announced(f"{_ANNOUNCEMENT}{stated}-{time_s}"):
+            with self._announced(f"{_ANNOUNCEMENT}{writer}-{time_s}"):
                 self._write_claim(claim)
         self._check_claim(claim)
         return claim
@@ -272,8 +272,8 @@ class _Store:
             names = [name.rpartition("/")[2] for name in self._ask(self._list_top_files)]
             others = [name for name in names if name.startswith(_ANNOUNCEMENT) and name != own]
             for name in others:
-                stated, _, time_s = name.removeprefix(_ANNOUNCEMENT).rpartition("-")
-                self._refuse_writer(f"{stated} {time_s}".encode())
+                writer, _, time_s = name.removeprefix(_ANNOUNCEMENT).rpartition("-")
+                self._refuse_writer(f"{writer} {time_s}".encode())
             self.remove(others)
             yield
         finally:
@@ -422,8 +422,8 @@ def _as_output(place: UrlPath) -> Iterator[None]:
 
 def _time_of(claim: bytes) -> float:
     """Return the time at which a claim was written [s since 1970]; 0 if the claim does not state it."""
-    stated = claim.rpartition(b" ")[2]
-    return float(stated) if stated.isdigit() and len(stated) < 15 else 0.0
+    time_text = claim.rpartition(b" ")[2]
+    return float(time_text) if time_text.isdigit() and len(time_text) < 15 else 0.0
 
 
 def _is_abandoned(claim: bytes) -> bool:

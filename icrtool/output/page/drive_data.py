@@ -220,10 +220,10 @@ def _models_data(
         name: {
             "every": every,
             "heading": packed_sums(heading[rows]),
-            "north": packed_sums(place.real[rows]),
-            "east": packed_sums(place.imag[rows]),
+            "north": packed_sums(position.real[rows]),
+            "east": packed_sums(position.imag[rows]),
         }
-        for name, (heading, place) in paths.items()
+        for name, (heading, position) in paths.items()
     }
     report_rows = rows_of(model.name for model in report.models)
     driven = {name: row for name, row in report_rows.items() if name in paths or name == "icr"}
@@ -282,11 +282,11 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
     """Yield the path of each calibration of the report, without and with a gyro."""
     recording = recording_of("gyro") if report.calibrations else None
     for used in report.calibrations:
-        turned, document = used.with_gyro, used.calibration
-        if recording is not None and document and not (turned and recording.track.gyro is None):
+        with_gyro, document = used.with_gyro, used.calibration
+        if recording is not None and document and not (with_gyro and recording.track.gyro is None):
             with suppress(DataError):
                 tested = calibrated_drive(
-                    stored_calibration(document), recording, used.name, with_gyro=turned,
+                    stored_calibration(document), recording, used.name, with_gyro=with_gyro,
                     refit_sensors=report.request.refit_sensors,
                 )  # fmt: skip
                 # The path has the last bias of the gyro, because there is one path for all starts.

@@ -116,17 +116,17 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
         summary, report_document = without_place(run, report)
     compared = with_smoothed_reference(run) if report.request.reference == "smoothed" else run
     begun = f"{datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    place, datum = "left out", summary.gnss.datum
+    origin_text, datum = "left out", summary.gnss.datum
     if coordinates:
-        place = "metric reference, no datum"
+        origin_text = "metric reference, no datum"
         if datum is not None:
-            place = f"datum {datum[0]:z.6f}° {datum[1]:z.6f}°, {datum[2]:z.1f} m"
+            origin_text = f"datum {datum[0]:z.6f}° {datum[1]:z.6f}°, {datum[2]:z.1f} m"
     made_with = (
         f"icrtool {summary.tool_version}, {summary.schema}, {report.schema}; {report.starts:,} states; "
         f"intervals by {report.intervals.method}"
     )
     provenance = [("log", f"{file.path}: {file.bytes:,} bytes, sha256 {file.sha256}") for file in summary.inputs]
-    made_from = Section("Provenance", [Facts([*provenance, ("place", place), ("made with", made_with)])], PAGE)
+    made_from = Section("Provenance", [Facts([*provenance, ("place", origin_text), ("made with", made_with)])], PAGE)
     about = (
         "From this drive icrtool learned how the robot slips, and tested how far wheel speeds alone keep the position."
     )
@@ -320,15 +320,13 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
     """Return the table of the calibrations: the numbers of each robot from all its logs."""
     grouped = any(calibration.group for calibration in calibrations)
     rows: list[list[str | Cell]] = []
-    incomplete, labels = (
-        any(calibration.left_out for calibration in calibrations),
-        {name: model.label for name, model in MODELS.items()},
-    )
+    incomplete = any(calibration.left_out for calibration in calibrations)
+    labels = {name: model.label for name, model in MODELS.items()}
     for calibration in calibrations:
         numbers = [Cell(calibration.reason), Cell("")]
         if calibration.multiplier is not None:
-            far = calibration.within
-            _, distance, _, between = ("", "–", "", "") if far is None else reach_row(far)
+            reach = calibration.within
+            _, distance, _, between = ("", "–", "", "") if reach is None else reach_row(reach)
             numbers = [
                 Cell(f"{calibration.multiplier:.3f}", f"± {calibration.multiplier_std:.3f}"),
                 Cell(distance, more=(between,) if between else ()),

@@ -168,9 +168,8 @@ def _reach_card(calibration: Calibration) -> Section:
     if (main_reach := reached.get(MAIN_ROW)) is not None:
         _, lead, _, between = reach_row(main_reach)
         text = f"within {BUDGET_M:g} m (95 %), by wheel speeds alone with {MAIN_ROW}, {test_words}"
-        text += f": the errors were measured at {', '.join(f'{h:g}' for h in horizons)} m, so it is {between}" * bool(
-            between
-        )
+        if between:
+            text += f": the errors were measured at {', '.join(f'{h:g}' for h in horizons)} m, so it is {between}"
     # The table of distances is that of `icrtool calibrate`.
     rows = [_held_out_distance(reached[name]) for name in shown_rows(names) if name in reached]
     table = Table("lrl", rows, (f"within {BUDGET_M:g} m (95 %)", "distance", ""))
@@ -466,15 +465,13 @@ QUANTITY_WORDS = {
 """Words for the quantities of a comparison."""
 
 
-def _pair_section(pair: documents.ComparedPair, place: str) -> Section:
-    """Return how parameters and held-out errors of two groups differ; `place`: name of its place on a page."""
+def _pair_section(pair: documents.ComparedPair, anchor: str) -> Section:
+    """Return how parameters and held-out errors of two groups differ; `anchor`: name of its place on a page."""
     rows, errors = [], []
     for parameter in pair.parameters:
         values = (f"{value:+z.3f}" for value in (parameter.first, parameter.second))
-        word, shown = (
-            QUANTITY_WORDS.get(parameter.quantity, parameter.quantity),
-            "yes" if parameter.significant else "no",
-        )
+        word = QUANTITY_WORDS.get(parameter.quantity, parameter.quantity)
+        shown = "yes" if parameter.significant else "no"
         rows.append((word, *values, with_std(parameter.difference, parameter.std, 3), shown))
     for row in pair.errors:
         if row.p95_m is not None and row.expected_m is not None:
@@ -486,4 +483,4 @@ def _pair_section(pair: documents.ComparedPair, place: str) -> Section:
     head = ("quantity", pair.first, pair.second, "difference ± σ", "shown")
     by_chance = "Parameters; a difference that is not shown may be chance (zero lies in its 95 % interval)"
     tables = [Table("lrrrl", rows, head, by_chance), Table("lr", errors, ("after", "95 %", "expected"), caption)]
-    return Section(f"{pair.second} compared with {pair.first}", tables, VERBOSE, name=place)
+    return Section(f"{pair.second} compared with {pair.first}", tables, VERBOSE, name=anchor)

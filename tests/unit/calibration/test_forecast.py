@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 
 from icrtool.calibration.error_growth import (
     SOURCES,
-    Spread,
+    ErrorMoments,
     forecast_drive,
     forecast_errors,
     forecast_plan,
@@ -98,7 +98,7 @@ def test_quantiles_and_means_are_those_of_drawn_errors() -> None:
     for covariance in (np.diag([1.0, 1.0]), np.array([[2.0, 0.7], [0.7, 0.5]]), np.diag([1.0, 0.0])):
         size = np.linalg.norm(rng.multivariate_normal([0.0, 0.0], covariance, 200_000), axis=1)
         xx, xy, yy = (np.array([[covariance[i, j]]]) for i, j in ((0, 0), (0, 1), (1, 1)))
-        spread = Spread(0 * xx, xx, xy, yy)
+        spread = ErrorMoments(0 * xx, xx, xy, yy)
         assert radius_of_share(spread, 0.95)[0] == pytest.approx(np.percentile(size, 95.0), rel=0.01)
         assert mean_error(spread)[0] == pytest.approx(size.mean(), rel=0.01)
 
