@@ -80,13 +80,13 @@ ROWS = (
     Row("three ICRs", "icr"),
     Row("`controller`", CONTROLLER),
     Row("six", "six"),
-    Row("eight, slip terms 0.1, 0.3, 0.2", RECOMMENDED, NARROW | {"omega_sw": 0.3, "omega_vw": 0.2}),
-    Row("slip terms 0.1, 0.03, 0.02", RECOMMENDED, NARROW),
-    Row("slip terms a third of these", RECOMMENDED, scaled(SLIP_TERMS, 1.0)),
-    Row("slip terms a tenth of these", RECOMMENDED, scaled(SLIP_TERMS, 0.3)),
-    Row("slip terms learned from the other logs", RECOMMENDED, learned=True),
-    Row("a tenth, wider where shown", RECOMMENDED, scaled(SLIP_TERMS, 0.3), widen=True),
-    Row("**`recommended`**: a third, wider where shown", RECOMMENDED),
+    Row("eight, wide", RECOMMENDED, NARROW | {"omega_sw": 0.3, "omega_vw": 0.2}),
+    Row("eight, medium", RECOMMENDED, NARROW),
+    Row("eight, narrow", RECOMMENDED, scaled(SLIP_TERMS, 1.0)),
+    Row("eight, very narrow", RECOMMENDED, scaled(SLIP_TERMS, 0.3)),
+    Row("eight, learned", RECOMMENDED, learned=True),
+    Row("eight, very narrow, wider where shown", RECOMMENDED, scaled(SLIP_TERMS, 0.3), widen=True),
+    Row("**`recommended`**: narrow, wider where shown", RECOMMENDED),
 )
 
 
