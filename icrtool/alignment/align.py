@@ -345,6 +345,6 @@ def measure_agreement(log: RobotLog, config: Config) -> Agreement:
     if fit is None:
         return NONE
     count = len(windows.begin)
-    size = np.hypot(fit.fit.residuals[:count], fit.fit.residuals[count : 2 * count])
+    size = np.hypot(fit.solution.residuals[:count], fit.solution.residuals[count : 2 * count])
     covered = np.unique(np.floor(track.distance[windows.begin] / LENGTH_M))
     return Agreement(float(np.quantile(size, SHARE)), LENGTH_M * len(covered))

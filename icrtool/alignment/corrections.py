@@ -48,7 +48,7 @@ from icrtool.alignment.wheel_alignment import (
 from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.config import Config
 from icrtool.kernels.track import Track
-from icrtool.records.measurements import RESPONSE_S, HeadingFacts, WheelFacts
+from icrtool.records.measurements import LONGEST_RESPONSE_S, HeadingFacts, WheelFacts
 from icrtool.records.notes import Note, note, notes_about
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
@@ -59,8 +59,8 @@ CORRECTION_SIGMAS = 2.5
 SMALLEST_LEAD_S, LARGEST_STD_S = 0.2, 0.1
 """Smallest lead that is corrected, and largest standard deviation of a corrected delay [s].
 
-A robot follows its wheels with a delay of up to `RESPONSE_S`, which is no error of a clock; the standard deviation of a
-delay includes it. A small lead more often comes from such a response than from a clock."""
+A robot follows its wheels with a delay of up to `LONGEST_RESPONSE_S`, which is no error of a clock; the standard
+deviation of a delay includes it. A small lead more often comes from such a response than from a clock."""
 
 
 class Delay(NamedTuple):
@@ -160,7 +160,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
 
 def _is_large(delay_s: float) -> bool:
     """Return whether a delay is longer than a robot's response to its wheels."""
-    return delay_s > RESPONSE_S or delay_s < -SMALLEST_LEAD_S
+    return delay_s > LONGEST_RESPONSE_S or delay_s < -SMALLEST_LEAD_S
 
 
 def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bool], *, together: bool) -> list[Note]:
@@ -227,7 +227,7 @@ class AlignedStreams(NamedTuple):
         if self.fit is None:
             none = np.empty(0, np.complex128)
             return measure_steps(track.place_t, track.place, track.laid), measure_steps(np.empty(0), none, none)
-        place, turn = self.fit.model.until_fixes(self.fit.fit.x)
+        place, turn = self.fit.model.until_fixes(self.fit.solution.x)
         turned = track.heading_at(track.place_t)
         return measure_steps(track.place_t, track.place, place), measure_steps(track.place_t, turned, turn)
 
@@ -256,7 +256,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
                 why = "the heading turns about where the robot drives backwards"
                 why = f"{why}: it is a course over ground, and left out"
                 return align_streams(without_heading(as_sent, why), config)
-            scatter = fit.heading_scatter if fit is not None and may_derive else 0.0
+            scatter = fit.heading_scatter_rad if fit is not None and may_derive else 0.0
             if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
                 return align_streams(bare, config)
             refuse_unexplained(log, fit, course)

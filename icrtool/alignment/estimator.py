@@ -1,15 +1,30 @@
 """One estimate of the relations between wheels, heading and positions: scales, ICRs, heading offset, delays.
 
 With the heading measured along the path, the equations are linear except in the heading offset and the delays. They
-compare windows of driven distance from fix i to fix j, and windows of time of the heading itself:
+compare windows of driven distance from fix to fix, and windows of time of the heading itself:
 
-    p_j - p_i = e^{j d} ∫(a v + m u + n |u| + j (c + l v) psi') e^{j psi},                           u = (V_l - V_r)/2
+    p_2 - p_1 = e^{i d} ∫(a v + m u + n |u| + i (c + l v) psi') e^{i psi},                           u = (V_l - V_r)/2
     psi(t + T) - psi(t) = k ∫w + q ∫v/b + g T,                                                       w = (V_l - V_r)/b
 
-with psi taken tau_h later than stamped, and p tau_p earlier. Then a is the wheel scale, W = a b/k, and in general
-y_r = (∂v_x/∂V_l)/(∂ω/∂V_l), y_l = (∂v_x/∂V_r)/(∂ω/∂V_r), x = -c - l v (Pentzer 2014, Eqs. 8-12). The sideways motion is
-computed with the measured turn psi', not with the wheels' turn: the latter leads while the robot begins to turn, which
-has the same effect as a delay.
+The symbols are:
+
+========= ============================================================================================
+p_1, p_2  positions of the first and the last fix of a window, north + i east [m]; i is the imaginary unit
+psi, psi' heading, clockwise [rad], and its rate [rad/s]; psi is taken tau_h later than stamped
+V_l, V_r  speeds of the left and right wheels, v their mean [m/s]
+b         track width [m]; W = a b/k is the separation of the ICRs [m]
+T         duration of a window of the heading [s]
+a, m, n   ``scale``, ``middle`` and ``drag``: speed ahead per v, per u and per magnitude of u [1]
+c, l      ``sideways`` [m] and ``slip`` [s]: sideways speed per turn rate, at rest and per v
+k, q, g   ``turn`` [1], ``asymmetry`` [1] and ``drift`` [rad/s] of the heading change
+d         ``offset``: heading offset [rad]
+tau_h     ``heading_delay`` [s]
+tau_p     ``position_after_heading`` [s]: p is taken tau_p earlier, in addition to tau_h
+========= ============================================================================================
+
+In general y_r = (∂v_x/∂V_l)/(∂ω/∂V_l), y_l = (∂v_x/∂V_r)/(∂ω/∂V_r), x = -c - l v (Pentzer 2014, Eqs. 8-12). The
+sideways motion is computed with the measured turn psi', not with the wheels' turn: the latter leads while the robot
+begins to turn, which has the same effect as a delay.
 
 A drive does not separate a sideways drift on straight paths from the offset. It does not separate the antenna's
 position from the ICRs: its forward part from x_icr, its right part from the middle of the y ICRs. At constant speed it
@@ -28,7 +43,7 @@ from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.kernels.track import Track
 from icrtool.motion.models import FIVE, MODELS, FittedModel, TrackGeometry
-from icrtool.records.measurements import RESPONSE_S
+from icrtool.records.measurements import LONGEST_RESPONSE_S
 
 ESTIMATE_NAMES = (
     "scale",
@@ -79,8 +94,9 @@ OVERLAP = 1.0
 """Number of residuals that count as one independent residual. It is 1, because the windows end at different fixes; the
 spread between groups of windows shows errors that windows have in common."""
 
-RESPONSE_STD_S = RESPONSE_S / math.sqrt(12.0)
-"""Standard deviation of a robot's response to its wheels [s]. No drive separates it from a delay of the streams."""
+RESPONSE_STD_S = LONGEST_RESPONSE_S / math.sqrt(12.0)
+"""Standard deviation of a robot's response to its wheels [s], uniform between 0 and the longest. No drive separates the
+response from a delay of the streams."""
 
 CLOCK_S_PER_M = 0.1
 """Apparent lag of the position behind the heading, per metre of track width [s/m]. It arises because a body follows a
@@ -146,7 +162,7 @@ class AlignmentFit(NamedTuple):
 
     Attributes
     ----------
-    fit : the robust fit
+    solution : the robust fit
     covariance : (k, k) covariance of the parameters
     width_m : track width b of the equations [m]
     windows : data of the fit
@@ -154,7 +170,7 @@ class AlignmentFit(NamedTuple):
     turning_speed_mps : mean speed, weighted by the square of the turn rate [m/s]; x_icr is stated at this speed
     """
 
-    fit: RobustFit
+    solution: RobustFit
     covariance: Floats
     width_m: float
     windows: DriveWindows
@@ -168,37 +184,45 @@ class AlignmentFit(NamedTuple):
         """
         if name == "position_delay":
             both = self.covariance[np.ix_([POSITION_LAG, HEADING_LAG], [POSITION_LAG, HEADING_LAG])]
-            return float(self.fit.x[POSITION_LAG] + self.fit.x[HEADING_LAG]), math.sqrt(max(float(both.sum()), 0.0))
+            delay_s = float(self.solution.x[POSITION_LAG] + self.solution.x[HEADING_LAG])
+            return delay_s, math.sqrt(max(float(both.sum()), 0.0))
         row = ESTIMATE_NAMES.index(name)
         variance = float(self.covariance[row, row])
         # Rounding may leave a variance below zero if the drive hardly shows the parameter.
-        return float(self.fit.x[row]), math.sqrt(variance) if variance > 0.0 else math.inf
+        return float(self.solution.x[row]), math.sqrt(variance) if variance > 0.0 else math.inf
 
     @property
-    def heading_scatter(self) -> float:
-        """Robust scatter of the heading [rad] beyond the fixes' noise, across windows or within a second."""
-        return max(self.scatter[1], float(self.fit.scale[-1]) / math.sqrt(2.0))
+    def heading_scatter_rad(self) -> float:
+        """Robust scatter of the heading without the fixes' noise [rad]: across windows or within a second."""
+        return max(self.angle_scatter_rad, float(self.solution.scale[-1]) / math.sqrt(2.0))
 
     @property
-    def scatter(self) -> tuple[float, float]:
-        """Robust scatter of the displacements along and across the heading beyond the fixes' noise, as shares."""
+    def distance_scatter(self) -> float:
+        """Robust scatter of the displacements along the heading, without the fixes' noise, per usual window length."""
+        return self._scatter(0)
+
+    @property
+    def angle_scatter_rad(self) -> float:
+        """Robust scatter across the heading, without the fixes' noise, per usual window length: a small angle [rad]."""
+        return self._scatter(len(self.windows.begin))
+
+    def _scatter(self, row: int) -> float:
+        """Return the scatter of the kind of the residual in a row, without the fixes' noise, per window length."""
         noise2 = 2.0 * self.windows.track.place_std_m**2
-        beyond = np.maximum(self.fit.scale[[0, len(self.windows.begin)]] ** 2 - noise2, 0.0)
-        along, across = (np.sqrt(beyond) / self.windows.usual_length_m).tolist()
-        return along, across
+        return math.sqrt(max(float(self.solution.scale[row]) ** 2 - noise2, 0.0)) / self.windows.usual_length_m
 
     @property
     def turn_wander_rad(self) -> float:
         """Rms difference between the turns of heading and wheels in a second [rad], from short windows."""
         u = len(self.windows.turn_begin)
         length = self.windows.turn_end - self.windows.turn_begin
-        return float(np.sqrt(np.mean(self.fit.residuals[-u:] ** 2 / length)))
+        return float(np.sqrt(np.mean(self.solution.residuals[-u:] ** 2 / length)))
 
     @property
     def turn_slip(self) -> float:
         """Robust scatter of the turns within a second about the wheels' turns, as a share of the usual turn."""
         usual = math.sqrt(float(np.mean(self.windows.heading_changes**2)))
-        return float(self.fit.scale[-1]) / max(usual, LEAST_TURN_RAD)
+        return float(self.solution.scale[-1]) / max(usual, LEAST_TURN_RAD)
 
     @property
     def slips(self) -> bool:
@@ -209,19 +233,21 @@ class AlignmentFit(NamedTuple):
         few = 0.0
         if self.windows.track.measured_t is not None:
             few = 2.0 / math.sqrt(2.0 * len(np.unique(self.windows.group)))
-        return self.scatter[0] * (1.0 - few) > SLIPPING or self.turn_slip * (1.0 - few) > TURNS_SLIPPING
+        return self.distance_scatter * (1.0 - few) > SLIPPING or self.turn_slip * (1.0 - few) > TURNS_SLIPPING
 
     def geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs about the antenna, multiplier and side scales, and their covariance (6, 6)."""
-        x, b, speed = self.fit.x, self.width_m, self.turning_speed_mps
+        x, b, speed = self.solution.x, self.width_m, self.turning_speed_mps
         # At one speed, the sideways slip l v has the same effect as c.
         aside = x[SIDEWAYS] + x[SIDE_SLIP] * speed
-        by = np.zeros((len(FIVE_TERMS.terms), len(x)))
-        by[[0, 1, 2, 3], [WHEEL_SCALE, ICR_MIDDLE, TURN_GAIN, SIDE_ASYMMETRY]] = 1.0
-        by[4, [TURN_GAIN, SIDEWAYS, SIDE_SLIP]] = np.array([aside, x[TURN_GAIN], x[TURN_GAIN] * speed]) * 2.0 / b
+        derivatives = np.zeros((len(FIVE_TERMS.terms), len(x)))
+        derivatives[[0, 1, 2, 3], [WHEEL_SCALE, ICR_MIDDLE, TURN_GAIN, SIDE_ASYMMETRY]] = 1.0
+        gains = np.array([aside, x[TURN_GAIN], x[TURN_GAIN] * speed])
+        derivatives[4, [TURN_GAIN, SIDEWAYS, SIDE_SLIP]] = gains * 2.0 / b
         sideways = x[TURN_GAIN] * aside * 2.0 / b
         parameters = np.append(x[[WHEEL_SCALE, ICR_MIDDLE, TURN_GAIN, SIDE_ASYMMETRY]], sideways)
-        values, covariance = FittedModel(FIVE_TERMS, parameters, by @ self.covariance @ by.T).geometry(b)
+        model = FittedModel(FIVE_TERMS, parameters, derivatives @ self.covariance @ derivatives.T)
+        values, covariance = model.geometry(b)
         # At one speed, positions that lag have the same effect as an antenna that is further back.
         covariance[2, 2] += (speed * _clock_std_s(self.windows.track, b)) ** 2
         return values, covariance
@@ -231,8 +257,8 @@ def residuals_by_estimate(fit: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
     count = 2 * len(fit.windows.begin)
     neutral = ESTIMATE_PRIOR_MEAN.copy()
-    neutral[TURN_GAIN] = fit.fit.x[TURN_GAIN]
-    before, after = (fit.model.evaluate(x)[0] for x in (neutral, fit.fit.x))
+    neutral[TURN_GAIN] = fit.solution.x[TURN_GAIN]
+    before, after = (fit.model.evaluate(x)[0] for x in (neutral, fit.solution.x))
     return ResidualsByEstimate(
         before[:count].reshape(2, -1), after[:count].reshape(2, -1), before[count:], after[count:],
         fit.windows.heading_changes,
@@ -308,16 +334,28 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
 
 
 class MotionOfWindows:
-    """Motion in windows for given parameters: residuals with their Jacobian, and place and turn until each fix."""
+    """Motion in windows for given parameters: residuals with their Jacobian, and motion and turn until each fix.
+
+    Attributes
+    ----------
+    track : the drive (n samples of the wheels)
+    windows : windows of the drive: w of distance, u of time
+    width_m : track width b [m]
+    v, u : (n,) mean of the sides' speeds, and half their difference [m/s]
+    edge_t : (2, w) times of the first and the last fix of each window [s]
+    to_window_axes : (w,) factors of magnitude 1 that turn a displacement to the axes along and across the heading
+    travel_m, wheel_turn_rad : (n + 1,) sums of v dt [m], and of the turn by the wheels [rad], from the start
+    smooth_heading : heading averaged over `SMOOTH_S` on both sides [rad], at the headings' times
+    """
 
     def __init__(self, windows: DriveWindows, width_m: float) -> None:
-        self.track, self.windows, self.b = windows.track, windows, width_m
+        self.track, self.windows, self.width_m = windows.track, windows, width_m
         track = windows.track
         self.v, self.u = track.mean_speed, track.half_difference
-        # Places are needed only at the begins and ends of windows. On a long drive these are few of the fixes.
+        # Positions are needed only at the starts and ends of windows. On a long drive these are few of the fixes.
         self.edge_t = track.place_t[np.stack([windows.begin, windows.end])]
-        self.level = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
-        self.turn_v, self.turn_w = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
+        self.to_window_axes = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
+        self.travel_m, self.wheel_turn_rad = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
         # The heading is averaged over `SMOOTH_S` on both sides, so that its noise does not count as a turn.
         t, area = track.heading_t, trapezoids(track.heading_t, track.heading)
         reach = np.minimum(np.minimum(t - t[0], t[-1] - t), SMOOTH_S)
@@ -339,14 +377,14 @@ class MotionOfWindows:
             begin, end = total[row] + part * (total[row + 1] - total[row])
             return np.asarray(end - begin)
 
-        by = np.zeros((len(x), len(self.windows.begin)), np.complex128)
-        by[WHEEL_SCALE], by[ICR_MIDDLE], by[TURN_DRAG] = laid(v), laid(u), laid(drag)
-        by[SIDEWAYS], by[SIDE_SLIP] = 1j * laid(rate), 1j * laid(v * rate)
-        predicted = x @ by
-        by[HEADING_OFFSET] = 1j * predicted
+        derivatives = np.zeros((len(x), len(self.windows.begin)), np.complex128)
+        derivatives[WHEEL_SCALE], derivatives[ICR_MIDDLE], derivatives[TURN_DRAG] = laid(v), laid(u), laid(drag)
+        derivatives[SIDEWAYS], derivatives[SIDE_SLIP] = 1j * laid(rate), 1j * laid(v * rate)
+        predicted = x @ derivatives
+        derivatives[HEADING_OFFSET] = 1j * predicted
         path = track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
         before, after = (np.interp(t + shift_s, track.t, path) for shift_s in (-DELAY_STEP_S, DELAY_STEP_S))
-        by[POSITION_LAG] = np.diff(before - after, axis=0) / (2 * DELAY_STEP_S)
+        derivatives[POSITION_LAG] = np.diff(before - after, axis=0) / (2 * DELAY_STEP_S)
         # The derivative of the unit vector of the heading is taken over `HEADING_STEP_S`.
         after, before = (
             track.heading_at(t + shift_s + x[HEADING_LAG]) + x[HEADING_OFFSET]
@@ -354,21 +392,25 @@ class MotionOfWindows:
         )
         turning = 0.5j * (after - before) / HEADING_STEP_S * np.exp(0.5j * (after + before))
         begin, end = np.interp(t, track.t + track.held / 2, aside) * turning
-        by[HEADING_LAG] = by[POSITION_LAG] + 1j * laid(rate * ahead) + end - begin
-        level = self.level * np.exp(-1j * x[HEADING_OFFSET])
-        place, by = (predicted - self.windows.seen) * level, by * level
-        turn, turn_by = self._turns(x)
+        derivatives[HEADING_LAG] = derivatives[POSITION_LAG] + 1j * laid(rate * ahead) + end - begin
+        to_axes = self.to_window_axes * np.exp(-1j * x[HEADING_OFFSET])
+        missed, derivatives = (predicted - self.windows.seen) * to_axes, derivatives * to_axes
+        turn, turn_derivatives = self._turns(x)
         return (
-            np.concatenate([place.real, place.imag, turn]),
-            np.concatenate([by.real, by.imag, turn_by], axis=1).T,
+            np.concatenate([missed.real, missed.imag, turn]),
+            np.concatenate([derivatives.real, derivatives.imag, turn_derivatives], axis=1).T,
         )
 
     def until_fixes(self, x: Floats) -> tuple[Complexes, Floats]:
-        """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,)."""
+        """Return motion by the wheels, north + i east [m], and turn [rad], until each fix (m,)."""
         nose, rate, ahead, aside = self._motion(x)
         path = self.track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
         t = self.track.place_t
-        turn = x[TURN_GAIN] * self.turn_w + x[SIDE_ASYMMETRY] / self.b * self.turn_v + x[HEADING_DRIFT] * self.track.t
+        turn = (
+            x[TURN_GAIN] * self.wheel_turn_rad
+            + x[SIDE_ASYMMETRY] / self.width_m * self.travel_m
+            + x[HEADING_DRIFT] * self.track.t
+        )
         return (
             np.asarray(np.interp(t - x[POSITION_LAG] - x[HEADING_LAG], self.track.t, path), np.complex128),
             np.asarray(np.interp(t - x[HEADING_LAG], self.track.t, turn), np.float64),
@@ -393,10 +435,11 @@ class MotionOfWindows:
             begin, end = np.interp(edges + shift_s, self.track.t, values)
             return np.asarray(end - begin)
 
-        by = np.zeros((len(x), edges.shape[1]))
-        by[TURN_GAIN], by[SIDE_ASYMMETRY] = over(self.turn_w), over(self.turn_v) / self.b
-        by[HEADING_DRIFT] = edges[1] - edges[0]
-        predicted = x @ by
-        later, earlier = over(self.turn_w, -DELAY_STEP_S), over(self.turn_w, DELAY_STEP_S)
-        by[HEADING_LAG] = x[TURN_GAIN] * (later - earlier) / (2 * DELAY_STEP_S)
-        return predicted - self.windows.heading_changes, by
+        derivatives = np.zeros((len(x), edges.shape[1]))
+        derivatives[TURN_GAIN] = over(self.wheel_turn_rad)
+        derivatives[SIDE_ASYMMETRY] = over(self.travel_m) / self.width_m
+        derivatives[HEADING_DRIFT] = edges[1] - edges[0]
+        predicted = x @ derivatives
+        later, earlier = over(self.wheel_turn_rad, -DELAY_STEP_S), over(self.wheel_turn_rad, DELAY_STEP_S)
+        derivatives[HEADING_LAG] = x[TURN_GAIN] * (later - earlier) / (2 * DELAY_STEP_S)
+        return predicted - self.windows.heading_changes, derivatives

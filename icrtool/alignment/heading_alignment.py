@@ -25,7 +25,7 @@ LIKE_RAD = math.radians(1.0)
 """Largest difference between an offset and its possible cause [rad]. Compasses in robots are no more accurate. An
 offset with a larger standard deviation gets no cause."""
 
-SMALLEST_NAME_RAD = math.radians(0.5)
+SMALLEST_CAUSE_RAD = math.radians(0.5)
 """Smallest declination or convergence that is stated as a cause [rad]."""
 
 UTM_LATITUDES_DEG = (-80.0, 84.0)
@@ -40,8 +40,8 @@ TURN_WORDS = {
 """Mountings of a sensor that are a cause of an offset: the offset [deg], and its words."""
 
 
-class OffsetName(NamedTuple):
-    """A possible cause of an offset.
+class OffsetCause(NamedTuple):
+    """A possible cause of an offset, and the directions of north that were compared.
 
     Attributes
     ----------
@@ -56,11 +56,11 @@ class OffsetName(NamedTuple):
     convergence_deg: float | None
 
 
-NO_NAME = OffsetName("", None, None)
-"""The name of an offset without a possible cause."""
+NO_CAUSE = OffsetCause("", None, None)
+"""Cause of an offset without a possible cause."""
 
 
-def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_ns: int) -> OffsetName:
+def find_offset_cause(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_ns: int) -> OffsetCause:
     """Return the possible cause of the offset of a heading, clockwise from north.
 
     Parameters
@@ -71,12 +71,12 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
     stamp_ns : time of the log, Unix time [ns]
     """
     if not sigma_rad <= LIKE_RAD:
-        return NO_NAME
+        return NO_CAUSE
     declination = _declination_deg(datum, stamp_ns) if datum is not None else None
     convergence = utm_convergence_deg(datum) if datum is not None else None
     norths, causes = [("", 0.0)], []
     for name, angle_deg in (("magnetic declination", declination), ("UTM grid convergence", convergence)):
-        if angle_deg is not None and abs(angle_deg) > math.degrees(SMALLEST_NAME_RAD):
+        if angle_deg is not None and abs(angle_deg) > math.degrees(SMALLEST_CAUSE_RAD):
             norths.append((f"{name} here is {angle_deg:+z.1f}°", math.radians(angle_deg)))
     for turn, turn_text in TURN_WORDS.items():
         for north_text, north in norths:
@@ -85,7 +85,7 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
             if away <= max(LIKE_RAD, 2.0 * sigma_rad) and texts:
                 # Fewer causes are more likely; among equally many causes the closest ones are.
                 causes.append((len(texts), away, " and ".join(texts)))
-    return OffsetName(min(causes)[2] if causes else "", declination, convergence)
+    return OffsetCause(min(causes)[2] if causes else "", declination, convergence)
 
 
 def utm_convergence_deg(datum: Datum) -> float | None:
@@ -221,8 +221,9 @@ def align_heading(
 
     Parameters
     ----------
-    fit : alignment with a sensor's heading, None without one or where the drive is too short; the next parameter is the
-        comparison of this heading with the course over ground
+    log, config : the log and the configuration
+    fit : alignment with a sensor's heading; None without such a heading, or where the drive is too short
+    course : comparison of this heading with the course over ground
     convention : the chosen convention of the streams
     derived : the heading where it was estimated, with every correction
 
@@ -233,13 +234,13 @@ def align_heading(
     corrects, mirrored = config.filter.rules.corrects, convention.heading < 0
     offset, std, scatter, applied, correlation_s = math.nan, math.nan, math.nan, 0.0, 0.0
     attitude = None if derived is None or derived.attitude is None else derived.estimate.offset
-    name, notes = NO_NAME, list[Note]()
+    cause, notes = NO_CAUSE, list[Note]()
     if corrects and config.frames.heading_offset_deg != "auto" and (derived is None or attitude is not None):
         applied = -math.radians(config.frames.heading_offset_deg)
     if fit is not None:
         turn, std = fit.estimate("offset")
-        offset, scatter = math.remainder(-turn, 2 * math.pi), fit.scatter[1]
-        applied, name, notes = _correction(log, config, fit, convention, (offset, std), applied)
+        offset, scatter = math.remainder(-turn, 2 * math.pi), fit.angle_scatter_rad
+        applied, cause, notes = _correction(log, config, fit, convention, (offset, std), applied)
     noisy = derived is None and corrects and scatter > NOISY_SCATTER_RAD
     if noisy:
         correlation_s = course.duration_s
@@ -248,7 +249,7 @@ def align_heading(
     if attitude is not None:
         offset, std = attitude
         applied = offset
-        text, name = _offset_in_words(log, offset, std, mirrored=mirrored)
+        text, cause = _offset_in_words(log, offset, std, mirrored=mirrored)
         notes = [finding for finding in notes if finding.code in OF_THE_SENSE]
         if not notes and _significant(offset, std):
             notes = [_offset_note(text, offset)]
@@ -268,9 +269,9 @@ def align_heading(
         applied_offset_deg=math.degrees(applied),
         applied_std_deg=math.degrees(scatter) if noisy else 0.0,
         std_deg=None if derived is None else finite_or_none(math.degrees(derived.estimate.median_causal_std)),
-        offset_name=name.text or None,
-        magnetic_declination_deg=name.declination_deg,
-        utm_convergence_deg=name.convergence_deg,
+        offset_name=cause.text or None,
+        magnetic_declination_deg=cause.declination_deg,
+        utm_convergence_deg=cause.convergence_deg,
         agreement=finite_or_none(course.agreement),
         mirrored_agreement=finite_or_none(course.mirrored_agreement),
     )
@@ -284,7 +285,7 @@ def _correction(
     convention: Convention,
     estimate: tuple[float, float],
     configured: float,
-) -> tuple[float, OffsetName, list[Note]]:
+) -> tuple[float, OffsetCause, list[Note]]:
     """Return the angle to subtract from a stated heading [rad], the cause of its offset, and findings.
 
     Parameters
@@ -295,7 +296,7 @@ def _correction(
     offset, std = estimate
     mirrored, corrects = convention.heading < 0, config.filter.rules.corrects
     pose_mirrored = mirrored and convention.position < 0 and fit.windows.track.same_clock
-    text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
+    offset_text, cause = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
     significant = _significant(offset - configured, std)
     applies = config.frames.heading_offset_deg == "auto" and corrects
     applied = offset if applies and (mirrored or significant) else configured
@@ -303,21 +304,21 @@ def _correction(
     if mirrored and not corrects:
         notes.append(OTHER_CONVENTION)
     elif pose_mirrored:
-        why = "the heading of the same poses is mirrored likewise: corrected; frames.heading sets it"
-        notes.append(note("heading_mirrored", why))
+        text = "the heading of the same poses is mirrored likewise: corrected; frames.heading sets it"
+        notes.append(note("heading_mirrored", text))
     elif mirrored:
-        yaw = f"its yaw is of the other convention (ENU/NED), offset {text}"
-        why = f"{OPPOSITE_SENSE}: {yaw}: applied; frames.heading sets it"
-        notes.append(note("heading_convention_corrected", why))
+        yaw = f"its yaw is of the other convention (ENU/NED), offset {offset_text}"
+        text = f"{OPPOSITE_SENSE}: {yaw}: applied; frames.heading sets it"
+        notes.append(note("heading_convention_corrected", text))
     elif significant and applies:
-        notes.append(_offset_note(text, applied))
+        notes.append(_offset_note(offset_text, applied))
     elif significant:
-        why = f"heading is {text} off the course over ground; {-math.degrees(configured):+z.1f}° is applied"
-        notes.append(note("heading_offset_differs", why))
-    return applied, name, notes
+        text = f"heading is {offset_text} off the course over ground; {-math.degrees(configured):+z.1f}° is applied"
+        notes.append(note("heading_offset_differs", text))
+    return applied, cause, notes
 
 
-def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool) -> tuple[str, OffsetName]:
+def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool) -> tuple[str, OffsetCause]:
     """Return an offset with its deviation in words, and its possible cause.
 
     Parameters
@@ -325,9 +326,11 @@ def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool
     mirrored : the offset is the offset of a yaw of the other convention
     """
     rest = offset + math.pi / 2 if mirrored else offset
-    name = name_offset(rest, std, log.datum, int(log.wheels.stamp_ns[0])) if _significant(rest, std) else NO_NAME
-    cause = f" ({name.text})" if name.text else ""
-    return f"{math.degrees(math.remainder(rest, 2 * math.pi)):+z.1f}° ± {math.degrees(std):.1f}°{cause}", name
+    cause = (
+        find_offset_cause(rest, std, log.datum, int(log.wheels.stamp_ns[0])) if _significant(rest, std) else NO_CAUSE
+    )
+    words = f" ({cause.text})" if cause.text else ""
+    return f"{math.degrees(math.remainder(rest, 2 * math.pi)):+z.1f}° ± {math.degrees(std):.1f}°{words}", cause
 
 
 def _offset_note(text: str, applied: float) -> Note:
@@ -351,8 +354,12 @@ def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseCo
     DataError
         The heading scatters by more than `UNEXPLAINED_RAD` about the motion, in either sense.
     """
-    if fit is not None and fit.heading_scatter > UNEXPLAINED_RAD and not course.mirrored_agreement > SHARED_DIRECTION:
-        spread = min(math.degrees(fit.heading_scatter), 180.0)
+    if (
+        fit is not None
+        and fit.heading_scatter_rad > UNEXPLAINED_RAD
+        and not course.mirrored_agreement > SHARED_DIRECTION
+    ):
+        spread = min(math.degrees(fit.heading_scatter_rad), 180.0)
         tried = f"with ENU, NED and any offset it scatters by {spread:.0f}° ({len(fit.windows.begin)} windows)"
         raise _no_heading(log, "does not follow the course over ground", tried)
 

@@ -24,7 +24,7 @@ from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapez
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
 from icrtool.motion.recording import fit_gyro_line
-from icrtool.records.measurements import RESPONSE_S, ReferenceJump, SensorData
+from icrtool.records.measurements import CAUTIOUS_RESPONSE_STD_S, ReferenceJump, SensorData
 
 KNOT_S = 0.1
 """Shortest time between two fixes that are compared [s]. Closer fixes add much noise and little information."""
@@ -241,7 +241,9 @@ def compare_by_duration(knots: Knots, motion: Motion) -> list[tuple[float, Compa
         first = np.flatnonzero(last < len(knots.t))
         last = last[first]
         usable = (last - first >= FEWEST_INTERVALS) & (knots.holes[first] == knots.holes[last])
-        by_duration.append((duration_s, compare_with_wheels(knots, motion, first[usable], last[usable], RESPONSE_S)))
+        by_duration.append(
+            (duration_s, compare_with_wheels(knots, motion, first[usable], last[usable], CAUTIOUS_RESPONSE_STD_S))
+        )
     return by_duration
 
 
@@ -264,17 +266,22 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     fit = estimate_alignment(windows, width_m)
     if fit is None:
         return None
-    place, turn = fit.model.until_fixes(fit.fit.x)
+    place, turn = fit.model.until_fixes(fit.solution.x)
     gain = max(abs(fit.estimate("turn")[0]), LEAST_TURN_GAIN)
     return Motion(place, turn, abs(fit.estimate("scale")[0]), width_m / 2 / gain)
 
 
-def compare_with_wheels(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: float) -> ComparedWindows:
+def compare_with_wheels(
+    knots: Knots, motion: Motion, first: Ints, last: Ints, response_std_s: float
+) -> ComparedWindows:
     """Return the motion of the reference minus the motion of the wheels between rows of the knots (w,).
 
     Parameters
     ----------
-    response_s : standard deviation of the time by which the robot follows its wheels
+    knots : the reference, at its knots
+    motion : motion by the wheels until each knot
+    first, last : (w,) rows of the knots at which each window begins and ends
+    response_std_s : standard deviation of the time by which the robot lags its wheels [s]
     """
     level = np.exp(-0.5j * (knots.heading[first] + knots.heading[last]))
     place, model, change = (
@@ -285,7 +292,7 @@ def compare_with_wheels(knots: Knots, motion: Motion, first: Ints, last: Ints, r
     scale2 = motion.scale**2
     noise = knots.variance[first] + knots.variance[last]
     held = scale2 * (knots.held_m2[last] - knots.held_m2[first]) / 2
-    ahead, spun = (scale2 * response_s**2 * square for square in (np.abs(change) ** 2, spin**2 / 4))
+    ahead, spun = (scale2 * response_std_s**2 * square for square in (np.abs(change) ** 2, spin**2 / 4))
     turn_noise = lever**2 * 2 * knots.turn_variance
     return ComparedWindows(
         first, last, missed.real, missed.imag, lever * (turn - model_turn), model.real, lever * model_turn,

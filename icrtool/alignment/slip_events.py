@@ -35,7 +35,7 @@ from icrtool.alignment.reference_motion import (
 )
 from icrtool.alignment.sensor_noise import MOVES_MPS
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.records.measurements import RESPONSE_S, ReferenceJump, SensorData, SlipEvent, SlipKind
+from icrtool.records.measurements import CAUTIOUS_RESPONSE_STD_S, ReferenceJump, SensorData, SlipEvent, SlipKind
 
 LEAST_SHARE = 0.3
 """Smallest severity of a slip event: the share of the wheels' motion that the robot does not make, or makes
@@ -104,7 +104,7 @@ def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
     Returns
     -------
     Disagreements
-        None where the motion model cannot be fitted.
+        Events and jumps in order of time; both are empty where the motion model cannot be fitted.
 
     Notes
     -----
@@ -158,7 +158,7 @@ def _find_events(
     row, outside = np.arange(len(knots.t)), np.ones(len(knots.t), np.bool_)
     if not len(windows.begin):
         return [], outside
-    steps = compare_with_wheels(knots, motion, row[:-1], row[1:], RESPONSE_S)
+    steps = compare_with_wheels(knots, motion, row[:-1], row[1:], CAUTIOUS_RESPONSE_STD_S)
     whole = knots.holes[1:] == knots.holes[:-1]
     free, events = whole.copy(), list[SlipEvent]()
     tests = max(1.0, float(knots.t[-1] - knots.t[0]) / WINDOWS_S[0])
@@ -224,10 +224,11 @@ def _weigh(
 
 
 def _exceeds(windows: ComparedWindows) -> Bools:
-    """Return which windows show more motion than the wheels, of a side and of distance or turn, or the opposite motion.
+    """Return a mask of the windows (w,) that slip cannot explain.
 
-    A single side is not enough: a side without grip makes the robot turn more than both sides would, and a robot in a
-    rut drags the slower side along.
+    In these windows one side, and also the distance or the turn, moves further than the wheels, or backwards. A single
+    side is not enough: a side without grip makes the robot turn more than both sides would, and a robot in a rut drags
+    the slower side along.
     """
     least = LEAST_SHARE * windows.path_m
 

@@ -26,7 +26,7 @@ from icrtool.alignment.sensor_noise import JUMP_SIGMAS, SLIP_SHARE, is_hole
 from icrtool.kernels.arrays import Complexes, Floats, Ints, trapezoids, wrapped
 from icrtool.kernels.robust import mad_std, robust_regression, soft_l1_weights
 from icrtool.kernels.track import Track
-from icrtool.records.measurements import RESPONSE_S
+from icrtool.records.measurements import CAUTIOUS_RESPONSE_STD_S
 from icrtool.records.samples import GyroAxes
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
@@ -335,7 +335,7 @@ def wheel_rate(track: Track, width_m: float) -> TurnRate:
     holes = np.column_stack([track.t[gaps], track.t[gaps + 1]])
     return TurnRate(
         track.t, rate, holes, scale_std=WHEEL_SCALE_STD, bias_std=math.radians(0.5), hole_std=_any_rate_std(rate),
-        delay_std_s=RESPONSE_S,
+        delay_std_s=CAUTIOUS_RESPONSE_STD_S,
     )  # fmt: skip
 
 

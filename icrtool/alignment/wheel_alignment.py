@@ -217,7 +217,7 @@ def align_wheels(
         filtered=filtered or None,
         windows=windows,
         stretches=0 if fit is None else len(np.union1d(fit.windows.group, fit.windows.turn_group)),
-        residual_m=None if fit is None else finite_or_none(math.hypot(*fit.fit.scale[[0, windows]].tolist())),
+        residual_m=None if fit is None else finite_or_none(math.hypot(*fit.solution.scale[[0, windows]].tolist())),
         turn_unexplained=finite_or_none(turn_unexplained),
         turn_unexplained_std=finite_or_none(turn_unexplained_std),
         ground_change_s=None if change is None else change.times_s[0],
@@ -269,7 +269,7 @@ def _find_scales(
     paths, as tight curves, the size is found here: the estimator's windows show the distance along any path.
     """
     if fit.slips:
-        apart = f"their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
+        apart = f"their distance differs by {100 * fit.distance_scatter:.0f} % from the robot's"
         slip = f"over {fit.windows.length_m[0]:.0f} m {apart}, their turns by {100 * fit.turn_slip:.0f} %"
         return (1.0, 1.0), [note("wheels_slip", f"the wheels slip: {slip}; no scale and no delay is corrected")]
     configured = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"

@@ -20,7 +20,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
 from icrtool.records import calibration_document as documents
-from icrtool.records.measurements import RESPONSE_S, Finding
+from icrtool.records.measurements import LONGEST_RESPONSE_S, Finding
 from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run import Run
 
@@ -226,8 +226,8 @@ def _settings(parameters: Mapping[str, documents.SensorParameter], run: Run) -> 
     # estimate multiplies.
     rows = (
         ("frames.heading_offset_deg", "heading_offset_deg", 0.0, 0.3, 1.0),
-        ("frames.reference_delay_s", "gnss_delay_s", 0.0, RESPONSE_S, 1.0),
-        ("frames.heading_delay_s", "heading_delay_s", 0.0, RESPONSE_S, 1.0),
+        ("frames.reference_delay_s", "gnss_delay_s", 0.0, LONGEST_RESPONSE_S, 1.0),
+        ("frames.heading_delay_s", "heading_delay_s", 0.0, LONGEST_RESPONSE_S, 1.0),
         ("frames.antenna_forward_m", "antenna_forward_m", 0.0, 0.02, 1.0),
         ("frames.antenna_right_m", "antenna_right_m", 0.0, 0.02, 1.0),
         ("wheels.left_scale", "left_scale", 1.0, 0.005, left),

@@ -12,7 +12,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import GUARDED, PRINTED, REFERENCE_STEP_S, FilterInputs, FilterParameters
-from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData, intervals_in
+from icrtool.records.measurements import CAUTIOUS_RESPONSE_STD_S, IcrStart, SensorData, intervals_in
 from icrtool.records.presets import FIELD, ProcessNoise
 from icrtool.records.run import WarmStart, width_or_usual_m
 
@@ -368,14 +368,15 @@ def _response_variance(data: FilterInputs, width_m: float) -> Floats:
     Notes
     -----
     A body follows its wheels with a delay, or slips less at first. Each change of the turn rate therefore moves the
-    heading by up to `RESPONSE_S` times this change. Within a change the errors of all steps have one sign, so white
-    noise with the size of a single step's error would be too small, and most of the error would go into the ICRs.
+    heading by the response time, with the standard deviation `CAUTIOUS_RESPONSE_STD_S`, times this change. Within a
+    change the errors of all steps have one sign, so white noise with the size of a single step's error would be too
+    small, and most of the error would go into the ICRs.
     """
     t = data.wheel_t
     turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m
     before, after = (np.interp(t + shift, t, turned) for shift in (-CHANGE_S, CHANGE_S))
     change = (after - 2.0 * turned + before) / CHANGE_S
-    return np.asarray((RESPONSE_S * change) ** 2 / CHANGE_S)
+    return np.asarray((CAUTIOUS_RESPONSE_STD_S * change) ** 2 / CHANGE_S)
 
 
 def _parameters(config: Config, data: FilterInputs, sensors: SensorData, noise: ProcessNoise) -> FilterParameters:

@@ -71,7 +71,7 @@ def normal_equations(residuals: Floats, jacobian: Floats, weights: Floats) -> tu
 
 
 def eliminate(
-    residuals: Floats, jacobian: Floats, weights: Floats, parts: Parts, pull: Floats, away: Floats
+    residuals: Floats, jacobian: Floats, weights: Floats, parts: Parts, prior_information: Floats, away: Floats
 ) -> Elimination:
     """Return the step of weighted least squares under a normal prior.
 
@@ -79,7 +79,7 @@ def eliminate(
     ----------
     residuals, jacobian, weights : (m,), (m, k + c), (m,)
     parts : parts of the data
-    pull, away : (k + p c,) information of the prior; parameters minus the mean of the prior
+    prior_information, away : (k + p c,) information of the prior; parameters minus the mean of the prior
     """
     count, q, c = len(parts.first) - 1, jacobian.shape[1], parts.own
     k = q - c
@@ -87,15 +87,15 @@ def eliminate(
     for i, (begin, end) in enumerate(zip(parts.first, parts.first[1:], strict=False)):
         rows = slice(begin, end)
         matrix[i], vector[i] = normal_equations(residuals[rows], jacobian[rows], weights[rows])
-    gradient = pull * away
+    gradient = prior_information * away
     vector[:, k:] += gradient[k:].reshape(count, c)
-    matrix[:, range(k, q), range(k, q)] += pull[k:].reshape(count, c)
+    matrix[:, range(k, q), range(k, q)] += prior_information[k:].reshape(count, c)
     both = np.concatenate([matrix[:, k:, :k], vector[:, k:, None]], axis=2)
     solved = np.linalg.solve(matrix[:, k:, k:], both)
     left = np.concatenate([matrix[:, :k, :k], vector[:, :k, None]], axis=2) - matrix[:, :k, k:] @ solved
     total = left.sum(axis=0)
     reduced = total[:, k] + gradient[:k]
-    shared = -np.linalg.solve(total[:, :k] + np.diag(pull[:k]), reduced)
+    shared = -np.linalg.solve(total[:, :k] + np.diag(prior_information[:k]), reduced)
     gain, shift = solved[:, :, :k], solved[:, :, k]
     step = np.concatenate([shared, -(shift + gain @ shared).ravel()])
     return Elimination(step, float((vector[:, k:] * shift).sum() - reduced @ shared), gain)

@@ -111,14 +111,14 @@ class Linearised:
         return robust_weights(self.residuals, self.scale, self.overlap)
 
     @cached_property
-    def of_data(self) -> Floats:
+    def data_information(self) -> Floats:
         """Gauss-Newton matrix (k, k) of the data, in which `overlap` residuals count as one."""
         return normal_equations(self.residuals, self.jacobian, self.weights)[0]
 
     @property
     def information(self) -> Floats:
         """Gauss-Newton matrix (k, k) of data and prior."""
-        return self.of_data + self.prior
+        return self.data_information + self.prior
 
     def gradients(self, group: Ints) -> Floats:
         """Return the gradient (g, k) of the data of each group; `group` (m,) is the group of each residual."""
@@ -129,19 +129,22 @@ class Linearised:
 
 @dataclass(frozen=True, kw_only=True)
 class RobustFit(Linearised):
-    """The minimum of a robust least squares problem. Jacobian and prior include that own parameters follow shared ones.
+    """The minimum of a robust least squares problem with k shared parameters, and c own parameters of each of p parts.
+
+    `jacobian` and `prior` are reduced to the shared parameters: the own parameters are eliminated (Schur complement,
+    `icrtool.kernels.elimination`).
 
     Attributes
     ----------
-    x : (k + p c,) the k shared parameters, then the own parameters of part after part
-    own_prior, own_pull : (p, k, k), (p, k) information and gradient by the priors of the own parameters of each part,
-        which follow the shared parameters
+    x : (k + p c,) the shared parameters, then the own parameters of part after part
+    own_prior, own_prior_gradient : (p, k, k), (p, k) information and gradient by the priors of the own parameters of
+        each part, which follow the shared parameters
     gain : (p, c, k) negative derivative of the own parameters of each part by the shared parameters
     """
 
     x: Floats
     own_prior: Floats
-    own_pull: Floats
+    own_prior_gradient: Floats
     gain: Floats
 
 
@@ -178,21 +181,21 @@ def robust_least_squares(
     -----
     Iteratively reweighted Gauss-Newton (Holland and Welsch 1977) with step halving; the scale follows the residuals.
     """
-    x, pull = np.array(start, np.float64), np.asarray(prior_std, np.float64) ** -2.0
+    x, prior_information = np.array(start, np.float64), np.asarray(prior_std, np.float64) ** -2.0
     residuals, jacobian = evaluate(x)
     parts = Parts(np.array([0, len(residuals)])) if parts is None else parts
     for _ in range(most_steps):
         scale = scale_by_kind(residuals, kind)
         weights = robust_weights(residuals, scale, overlap)
-        step, decrease, _ = eliminate(residuals, jacobian, weights, parts, pull, x - prior_mean)
+        step, decrease, _ = eliminate(residuals, jacobian, weights, parts, prior_information, x - prior_mean)
         if decrease < settled**2:
             # The residuals after a short step are computed to first order, without a further evaluation.
             x, residuals = x + step, residuals + parts.change(jacobian, step)
             break
-        before = _cost(residuals / scale, overlap, pull, x - prior_mean)
+        before = _cost(residuals / scale, overlap, prior_information, x - prior_mean)
         tried = evaluate(x + step)
         for _ in range(MOST_HALVINGS):
-            after = _cost(tried[0] / scale, overlap, pull, x + step - prior_mean)
+            after = _cost(tried[0] / scale, overlap, prior_information, x + step - prior_mean)
             if after <= before:
                 break
             step = step / 2.0
@@ -204,16 +207,18 @@ def robust_least_squares(
         if before - after < settled**2:
             break
     scale = scale_by_kind(residuals, kind)
-    solution = eliminate(residuals, jacobian, robust_weights(residuals, scale, overlap), parts, pull, x - prior_mean)
+    solution = eliminate(
+        residuals, jacobian, robust_weights(residuals, scale, overlap), parts, prior_information, x - prior_mean
+    )
     jacobian = solution.reduced(jacobian, parts)
     k = jacobian.shape[1]
-    own, away = (of_all[k:].reshape(solution.gain.shape[:2]) for of_all in (pull, x - prior_mean))
+    own, away = (of_all[k:].reshape(solution.gain.shape[:2]) for of_all in (prior_information, x - prior_mean))
     own_prior = np.einsum("pck,pc,pcl->pkl", solution.gain, own, solution.gain)
-    own_pull = -np.einsum("pck,pc->pk", solution.gain, own * away)
-    prior = np.diag(pull[:k]) + own_prior.sum(axis=0)
+    own_prior_gradient = -np.einsum("pck,pc->pk", solution.gain, own * away)
+    prior = np.diag(prior_information[:k]) + own_prior.sum(axis=0)
     return RobustFit(
         residuals=residuals, jacobian=jacobian, scale=scale, prior=prior, overlap=overlap, x=x, own_prior=own_prior,
-        own_pull=own_pull, gain=solution.gain,
+        own_prior_gradient=own_prior_gradient, gain=solution.gain,
     )  # fmt: skip
 
 
@@ -245,7 +250,7 @@ def robust_weights(residuals: Floats, scale: Floats, overlap: float) -> Floats:
 
 
 def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None = None) -> Floats:
-    """Return the covariance (k, k) of a robust fit; no variance is below its bound by the information.
+    """Return the covariance (k, k) of a robust fit; no variance is below the one in the inverse information.
 
     Parameters
     ----------
@@ -294,7 +299,7 @@ def _spread(gradients: Floats, expected: Floats | None) -> Floats:
 
 
 def _grouped(group: Ints) -> tuple[Ints, Ints]:
-    """Return the rows (m,) in the order of their groups, and the place of the first row of each group (g,)."""
+    """Return the rows (m,) in the order of their groups, and the index of the first row of each group (g,)."""
     order = np.argsort(group, kind="stable")
     return order, np.flatnonzero(np.diff(group[order], prepend=group[order[:1]] - 1))
 
@@ -326,7 +331,9 @@ def correlated_covariance(fit: Linearised, group: Ints) -> Floats:
 
 
 def student_covariance(fit: Linearised, levels: Sequence[Ints]) -> Floats:
-    """Return the covariance (k, k) of a robust fit, with which two standard deviations hold 95.4 % also for few groups.
+    """Return the covariance (k, k) of a robust fit, widened for few groups.
+
+    With it, +-2 standard deviations contain the parameter with a probability of 95.4 %.
 
     Parameters
     ----------
@@ -341,7 +348,7 @@ def student_covariance(fit: Linearised, levels: Sequence[Ints]) -> Floats:
     estimate, too, so it is multiplied by Student's t (1908), expanded about the normal quantile 2 (Abramowitz and
     Stegun 1964, 26.7.5).
     """
-    variance = fit.of_data
+    variance = fit.data_information
     for group in levels:
         gradients = fit.gradients(group)
         count = len(gradients)
@@ -375,7 +382,7 @@ def long_run_factor(series: Floats) -> Floats:
     return factor
 
 
-def _cost(z: Floats, overlap: float, pull: Floats, away: Floats) -> float:
+def _cost(z: Floats, overlap: float, prior_information: Floats, away: Floats) -> float:
     """Return the loss of residuals in standard deviations, prior included; infinite where it is not a number."""
-    cost = soft_l1_loss(z) / overlap + float((pull * away**2).sum())
+    cost = soft_l1_loss(z) / overlap + float((prior_information * away**2).sum())
     return cost if np.isfinite(cost) else float("inf")

@@ -364,7 +364,7 @@ class PooledFit(FittedModel):
         at = self.solution
         both = [self._derivatives(self.pool.rows(i)) for i in range(len(self.pool.windows))]
         gradients, curvatures = (np.array(column) for column in zip(*both, strict=True))
-        return gradients + at.own_pull, curvatures + at.own_prior
+        return gradients + at.own_prior_gradient, curvatures + at.own_prior
 
     @cached_property
     def curvature(self) -> Floats:

@@ -13,8 +13,12 @@ from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.samples import GyroSamples, HeadingSamples, HeadingSensor, Samples, StreamChoice, WheelSamples
 
-RESPONSE_S = 0.1
+LONGEST_RESPONSE_S = 0.1
 """Longest lag of the body's motion behind the wheel speeds [s]. Source: rigid-body simulations."""
+
+CAUTIOUS_RESPONSE_STD_S = LONGEST_RESPONSE_S
+"""Standard deviation of the lag in tests of slip and in the noise of the heading [s]. It equals the longest lag, so a
+lag alone shows no slip. Where the lag itself is estimated, `icrtool.alignment.estimator.RESPONSE_STD_S` applies."""
 
 MOVING_S, TURNING_MPS = 60.0, 0.01
 """A robot counts as moving for `MOVING_S` [s] before and after its wheels turn faster than `TURNING_MPS` [m/s]."""

@@ -38,7 +38,7 @@ from icrtool.output.text_format import (
     run_title,
     topics_text,
 )
-from icrtool.records.measurements import RESPONSE_S, GroundStretch
+from icrtool.records.measurements import LONGEST_RESPONSE_S, GroundStretch
 from icrtool.records.notes import Note, first_to_read, is_grave
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.run_document import ControllerNumbers, RunDocument
@@ -323,7 +323,7 @@ def _delay_checks(summary: RunDocument) -> Iterator[Check]:
             )
     multiplier = summary.icr.separation_multiplier
     slips = multiplier is None or multiplier > SLIPPING_MULTIPLIER
-    cause = "slip of the wheels" if slips else f"the robot's response to its wheels, up to {RESPONSE_S:g} s,"
+    cause = "slip of the wheels" if slips else f"the robot's response to its wheels, up to {LONGEST_RESPONSE_S:g} s,"
     lines = [*checks, f"not corrected: {cause} has the same effect"] if checks else []
     speed = summary.drive.speed_mean_mps
     if summary.gnss.delay_s is None and summary.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:

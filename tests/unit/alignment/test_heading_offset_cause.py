@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from icrtool.alignment.heading_alignment import name_offset, utm_convergence_deg
+from icrtool.alignment.heading_alignment import find_offset_cause, utm_convergence_deg
 from icrtool.records.samples import Datum
 
 SIGMA_RAD = math.radians(0.1)
@@ -18,10 +18,10 @@ DECLINATION_DEG = -10.55
 
 
 def test_a_heading_from_magnetic_north_is_named() -> None:
-    name = name_offset(math.radians(-DECLINATION_DEG), SIGMA_RAD, PENNSYLVANIA, AUTUMN_2025_NS)
-    assert name.declination_deg == pytest.approx(DECLINATION_DEG, abs=0.1)
-    assert name.text == "magnetic declination here is -10.6°"
-    assert name_offset(math.radians(DECLINATION_DEG), SIGMA_RAD, PENNSYLVANIA, AUTUMN_2025_NS).text == ""
+    cause = find_offset_cause(math.radians(-DECLINATION_DEG), SIGMA_RAD, PENNSYLVANIA, AUTUMN_2025_NS)
+    assert cause.declination_deg == pytest.approx(DECLINATION_DEG, abs=0.1)
+    assert cause.text == "magnetic declination here is -10.6°"
+    assert find_offset_cause(math.radians(DECLINATION_DEG), SIGMA_RAD, PENNSYLVANIA, AUTUMN_2025_NS).text == ""
 
 
 @pytest.mark.parametrize(
@@ -35,13 +35,13 @@ def test_a_heading_from_magnetic_north_is_named() -> None:
     ],
 )
 def test_turns_are_named_alone_and_with_magnetic_north(degrees: float, text: str) -> None:
-    assert name_offset(math.radians(degrees), SIGMA_RAD, PENNSYLVANIA, AUTUMN_2025_NS).text == text
+    assert find_offset_cause(math.radians(degrees), SIGMA_RAD, PENNSYLVANIA, AUTUMN_2025_NS).text == text
 
 
 def test_without_a_place_or_a_date_there_is_no_north_to_name() -> None:
-    assert name_offset(math.radians(10.5), SIGMA_RAD, None, AUTUMN_2025_NS).text == ""
-    name = name_offset(math.radians(10.5), SIGMA_RAD, PENNSYLVANIA, 10**12)
-    assert (name.declination_deg, name.text) == (None, "")
+    assert find_offset_cause(math.radians(10.5), SIGMA_RAD, None, AUTUMN_2025_NS).text == ""
+    cause = find_offset_cause(math.radians(10.5), SIGMA_RAD, PENNSYLVANIA, 10**12)
+    assert (cause.declination_deg, cause.text) == (None, "")
 
 
 @pytest.mark.parametrize(("latitude", "longitude"), [(60.0, 11.5), (-35.0, 150.9), (47.0, 6.2), (0.0, 5.0)])

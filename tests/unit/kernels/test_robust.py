@@ -193,7 +193,7 @@ def test_parts_with_parameters_of_their_own_give_what_the_dense_jacobian_gives()
     weights = robust_weights(one.residuals, one.scale, 2.0)[:, None]
     of_parts = one.jacobian.T @ (weights * one.jacobian) + one.own_prior.sum(axis=0)
     np.testing.assert_allclose(one.information, of_parts + np.diag(std[:shared] ** -2.0), rtol=1e-9)
-    gradient = one.jacobian.T @ (weights[:, 0] * one.residuals) + one.own_pull.sum(axis=0)
+    gradient = one.jacobian.T @ (weights[:, 0] * one.residuals) + one.own_prior_gradient.sum(axis=0)
     assert np.all(np.abs(gradient + one.x[:shared] / std[:shared] ** 2) < 0.05 * np.sqrt(np.diag(one.information)))
 
 
