@@ -214,7 +214,7 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
 
 
 def align_heading(
-    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseComparison, convention: Convention,
+    log: RobotLog, config: Config, fit: AlignmentFit | None, comparison: CourseComparison, convention: Convention,
     derived: DerivedHeading | None,
 ) -> tuple[HeadingFacts, float, list[Note]]:  # fmt: skip
     """Return the facts about the heading: its offset, its noise and its correction.
@@ -223,7 +223,7 @@ def align_heading(
     ----------
     log, config : the log and the configuration
     fit : alignment with a sensor's heading; None without such a heading, or where the drive is too short
-    course : comparison of this heading with the course over ground
+    comparison : comparison of this heading with the course over ground
     convention : the chosen convention of the streams
     derived : the heading where it was estimated, with every correction
 
@@ -243,7 +243,7 @@ def align_heading(
         applied, cause, notes = _correction(log, config, fit, convention, (offset, std), applied)
     noisy = derived is None and corrects and scatter > NOISY_SCATTER_RAD
     if noisy:
-        correlation_s = course.duration_s
+        correlation_s = comparison.duration_s
         spread = f"by {math.degrees(scatter):.0f}° about the course over ground"
         notes.append(note("heading_scatters", f"the heading scatters {spread}: its noise is raised to that"))
     if attitude is not None:
@@ -261,7 +261,7 @@ def align_heading(
     facts = HeadingFacts(
         source=source if derived is None else derived.source,
         parts=None if derived is None else derived.why,
-        windows=course.windows,
+        windows=comparison.windows,
         applied_mirror=mirrored and corrects,
         offset_deg=finite_or_none(math.degrees(offset)),
         offset_std_deg=finite_or_none(math.degrees(std)),
@@ -272,8 +272,8 @@ def align_heading(
         offset_name=cause.text or None,
         magnetic_declination_deg=cause.declination_deg,
         utm_convergence_deg=cause.convergence_deg,
-        agreement=finite_or_none(course.agreement),
-        mirrored_agreement=finite_or_none(course.mirrored_agreement),
+        agreement=finite_or_none(comparison.agreement),
+        mirrored_agreement=finite_or_none(comparison.mirrored_agreement),
     )
     return facts, correlation_s, notes
 
@@ -344,7 +344,7 @@ def _significant(offset: float, std: float) -> bool:
     return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, EVIDENCE_SIGMAS * std)
 
 
-def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseComparison) -> None:
+def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, comparison: CourseComparison) -> None:
     """Raise where no convention and no offset make the heading follow the motion of wheels and fixes.
 
     A heading of the other convention that the configuration keeps also scatters. It is used, with a warning.
@@ -357,7 +357,7 @@ def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseCo
     if (
         fit is not None
         and fit.heading_scatter_rad > UNEXPLAINED_RAD
-        and not course.mirrored_agreement > SHARED_DIRECTION
+        and not comparison.mirrored_agreement > SHARED_DIRECTION
     ):
         spread = min(math.degrees(fit.heading_scatter_rad), 180.0)
         tried = f"with ENU, NED and any offset it scatters by {spread:.0f}° ({len(fit.windows.begin)} windows)"

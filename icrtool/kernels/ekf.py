@@ -61,7 +61,9 @@ def wrap(angle: float) -> float:
 
 
 @njit_part
-def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, parameters: FilterParameters) -> bool:
+def store_rejection(
+    run: Floats, t: float, nu_n: float, nu_e: float, limit: float, parameters: FilterParameters
+) -> bool:
     """Store a rejected innovation; return whether the rejected innovations agree, so that the filter must be wrong.
 
     Wrong fixes disagree with each other, and a wrong filter has the same innovation again and again.
@@ -69,8 +71,10 @@ def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, 
     Parameters
     ----------
     run : (4,) number of agreeing innovations, time of the first one [s], and the last innovation
-    t : time of the innovation [s]; nu_n, nu_e : the innovation
-    limit : largest squared difference of two consecutive innovations that agree
+    t : time of the innovation [s]
+    nu_n, nu_e : the innovation [m], north and east; of a heading [rad] and 0
+    limit : largest squared difference of two consecutive innovations that agree [m^2], or [rad^2]
+    parameters : parameters of the filter
     """
     step_n, step_e = nu_n - run[2], nu_e - run[3]
     if run[0] > 0.0 and step_n * step_n + step_e * step_e <= limit:
@@ -108,13 +112,13 @@ def keep_sides(x: Floats, P: Floats, least: float) -> None:
     The right track is right of the left track: the guard of Pentzer 2014 (Section 5.1), applied to the states. Estimate
     projection (Simon and Chia 2002); the covariance does not change.
     """
-    for turn in range(4):
-        place = 3 + turn % 2
-        sign = 1.0 if place == 3 else -1.0
-        beyond = least - sign * x[place]
+    for sweep in range(4):
+        row = 3 + sweep % 2
+        sign = 1.0 if row == 3 else -1.0
+        beyond = least - sign * x[row]
         if beyond > 0.0:
             for i in range(6):
-                x[i] += sign * P[i, place] / P[place, place] * beyond
+                x[i] += sign * P[i, row] / P[row, row] * beyond
 
 
 @njit_part
@@ -139,7 +143,7 @@ def take_fix(
     code, more_n, more_e = USED, 0.0, 0.0
     if nis > parameters.gnss_gate:
         code = GATED
-        if rejected_run(run, state.reached[0], nu_n, nu_e, parameters.gnss_gate * 2.0 * (r_n + r_e), parameters):
+        if store_rejection(run, state.reached[0], nu_n, nu_e, parameters.gnss_gate * 2.0 * (r_n + r_e), parameters):
             code = RECOVERED
             more_n, more_e = nu_n * nu_n, nu_e * nu_e
             P[0, 0] += more_n
@@ -173,7 +177,7 @@ def take_heading(
     code, added = USED, 0.0
     if nis > parameters.heading_gate:
         code = GATED
-        if rejected_run(run, state.reached[0], nu, 0.0, parameters.heading_gate * 2.0 * r, parameters):
+        if store_rejection(run, state.reached[0], nu, 0.0, parameters.heading_gate * 2.0 * r, parameters):
             code = RECOVERED
             added = nu * nu
             P[2, 2] += added
@@ -331,7 +335,11 @@ def run_ekf(
 
     Parameters
     ----------
-    t0 : time of the start [s]; x0 : (6,) state; P0 : (6, 6) covariance
+    data : the measurements
+    t0 : time of the start [s]
+    x0 : (6,) state at the start
+    P0 : (6, 6) covariance at the start
+    parameters : parameters of the filter
     stops : rows of recorded states, ascending, at which the whole covariance is kept
     """
     first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)

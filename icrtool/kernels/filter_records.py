@@ -161,7 +161,7 @@ class FilterState(NamedTuple):
     Attributes
     ----------
     reached : (2,) time [s], and path length until then [m]
-    rejected : (2, 4) argument `run` of `rejected_run`, for fixes and for headings
+    rejected : (2, 4) argument `run` of `store_rejection`, for fixes and for headings
     x : (6,); P : (6, 6)
     """
 

@@ -176,27 +176,31 @@ def collect_tables(
         for uncut_block in blocks:
             block = cut.apply(uncut_block)
             # np.unique takes four times as long as sorting.
-            numbers = np.sort(block.channel)
-            for number in numbers[np.diff(numbers, prepend=-1) > 0].tolist():
-                if number not in wanted:
+            channel_ids = np.sort(block.channel)
+            for channel_id in channel_ids[np.diff(channel_ids, prepend=-1) > 0].tolist():
+                if channel_id not in wanted:
                     continue
                 try:
-                    if number not in collectors:
+                    if channel_id not in collectors:
                         # A definition is compiled at its first message, because a log may declare any number of topics.
-                        collectors[number] = None
-                        earlier_table = by_topic.get(topics[number])
-                        by_topic[topics[number]] = collector_for(by_id[number], wanted[number], earlier_table, budget)
-                        collectors[number] = by_topic[topics[number]]
-                    if (collector := collectors[number]) is not None:
-                        collector.feed(block, number)
+                        collectors[channel_id] = None
+                        earlier_table = by_topic.get(topics[channel_id])
+                        by_topic[topics[channel_id]] = collector_for(
+                            by_id[channel_id], wanted[channel_id], earlier_table, budget
+                        )
+                        collectors[channel_id] = by_topic[topics[channel_id]]
+                    if (collector := collectors[channel_id]) is not None:
+                        collector.feed(block, channel_id)
                 except DefinitionError as err:
-                    unread[by_id[number].topic] = str(err)
+                    unread[by_id[channel_id].topic] = str(err)
             if progress is not None:
                 progress(container.share_read())
-    _report_definitions(container, [by_id[number] for number, collector in collectors.items() if collector is not None])
-    for number in wanted.keys() - collectors.keys():
-        by_topic.setdefault(topics[number], TopicCollector(by_id[number]))
-    in_order = dict.fromkeys(topics[number] for number in wanted)
+    _report_definitions(
+        container, [by_id[channel_id] for channel_id, collector in collectors.items() if collector is not None]
+    )
+    for channel_id in wanted.keys() - collectors.keys():
+        by_topic.setdefault(topics[channel_id], TopicCollector(by_id[channel_id]))
+    in_order = dict.fromkeys(topics[channel_id] for channel_id in wanted)
     tables = [by_topic[topic].table() for topic in in_order if topic in by_topic]
     return tables, unread
 

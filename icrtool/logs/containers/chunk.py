@@ -98,7 +98,7 @@ class Chunk(NamedTuple):
         return self.channels is not None and not self.channels <= wanted
 
     @property
-    def is_stored(self) -> bool:
+    def is_uncompressed(self) -> bool:
         """Whether the records are not compressed, so that each can be read alone."""
         return self.compression in STORED and self.index_length > 0 and self.size <= self.length
 
@@ -209,8 +209,8 @@ class Records(NamedTuple):
 
     Attributes
     ----------
-    messages : (4, n) channel, log time [ns], first byte and end of the content of each message
-    others : operation code, first byte, and first byte and end of the content of each other record
+    messages : (4, n) channel, log time [ns], begin and end offset of the content of each message
+    others : operation code, offset, and begin and end offset of the content of each other record
     stop : the byte behind the last record: an incomplete record, another kind of record, or the end
     """
 
@@ -226,13 +226,13 @@ def record_starts(
     record_end: Callable[[memoryview, int, int], int],
     message_ends: Callable[[Bytes, Ints], Ints],
 ) -> tuple[Ints, int]:
-    """Return the first bytes of the records from `begin` on (n,), and the byte behind the last record.
+    """Return the offsets of the records from `begin` on (n,), and the byte behind the last record.
 
     Parameters
     ----------
-    hint : (m,) first bytes of messages by the index, ascending; None without an index
+    hint : (m,) offsets of messages by the index, ascending; None without an index
     record_end : returns the end of the record at a byte, given the end of the data; the byte itself without a record
-    message_ends : returns the ends of messages (n,); the first byte of a message where there is none
+    message_ends : returns the ends of messages (n,); the offset of a message where there is none
     """
     view = data.data
     if hint is not None and 0 < len(hint) <= MOST_RECORDS and hint[0] >= begin:
@@ -253,7 +253,7 @@ def record_starts(
 def follow_records(
     data: memoryview, at: int, end: int, record_end: Callable[[memoryview, int, int], int]
 ) -> tuple[list[int], int]:
-    """Return the first bytes of the records in [at, end), found one by one, and the byte behind the last record."""
+    """Return the offsets of the records in [at, end), found one by one, and the byte behind the last record."""
     starts: list[int] = []
     while len(starts) < MOST_RECORDS and (after := record_end(data, at, end)) > at:
         starts.append(at)

@@ -64,8 +64,8 @@ class ChunkPart(NamedTuple):
 
     Attributes
     ----------
-    messages : (m,) first bytes of the messages in the records that are read, by the index; None without an index
-    ranges : (2, n) first bytes and ends of the wanted records if only these are read; None: all are read
+    messages : (m,) offsets of the messages in the records that are read, by the index; None without an index
+    ranges : (2, n) begin and end offsets of the wanted records if only these are read; None: all are read
     held : bytes of a distant file that were read ahead and contain the chunk; None: not read ahead
     records : wanted records of a distant file that were read ahead; None: not read ahead
     """
@@ -115,7 +115,7 @@ class ChunkedFile(Container):
     """Whether channels are learned from records, as long as a file without an index is being opened."""
 
     _chunk_head = 0
-    """Number of bytes from the begin of the record of a chunk to its content."""
+    """Number of bytes from the start of the record of a chunk to its content."""
 
     _unpacks_parts = False
     """Whether a compressed chunk may be decompressed in part. This saves time only where it has a checksum."""
@@ -124,7 +124,7 @@ class ChunkedFile(Container):
     """Function that finds records: `scan_mcap` or `scan_bag`."""
 
     _message_index: Callable[[bytes], tuple[Ints, Ints]]
-    """Function that returns the first bytes of the messages of a chunk in its records (n,), and their channels (n,);
+    """Function that returns the offsets of the messages of a chunk in its records (n,), and their channels (n,);
     both are empty where the index is damaged."""
 
     def __init__(self, path: Path, message_compression: str = "", source: LocalFile | RemoteFile | None = None) -> None:
@@ -144,7 +144,7 @@ class ChunkedFile(Container):
                 for _ in self._read_in_order():
                     pass
                 self._is_learning = False
-            self.channels = self._described_channels()
+            self.channels = self._read_channels()
         except BaseException:
             self.close()
             raise
@@ -160,7 +160,7 @@ class ChunkedFile(Container):
         """
 
     @abstractmethod
-    def _described_channels(self) -> Sequence[Channel]:
+    def _read_channels(self) -> Sequence[Channel]:
         """Return the channels that the index or the records describe."""
 
     @abstractmethod
@@ -186,11 +186,11 @@ class ChunkedFile(Container):
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         """Store a record of `data` that describes a channel; `record` is an item of `Records.others`."""
 
-    def _with_header(self, chunk: Chunk) -> Chunk:
+    def _complete(self, chunk: Chunk) -> Chunk:
         """Return a chunk of the index, completed by the header of its record."""
         return chunk
 
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
+    def _yield_blocks(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels in the order of their chunks; threads make the next blocks."""
         if self._chunks is None:
             yield from make_ahead(self._read_in_order())
@@ -199,12 +199,12 @@ class ChunkedFile(Container):
         located = (self._locate_part(chunk, wanted) for chunk in needed)
         parts = located if self._remote is None else self._read_ahead(self._remote, needed, wanted)
         groups = zip(_group_parts(parts), reused_buffers(), strict=False)
-        for (group, spaces), made in work_ahead(
+        for (group, spaces), join in work_ahead(
             lambda item: self._join_parts(*item), groups, CHUNK_THREADS, BLOCKS_AHEAD
         ):
             self._at = group[-1].chunk.at
             try:
-                block, inflation = made()
+                block, inflation = join()
             except (DecompressionError, MemoryError):
                 # A chunk of the group is damaged: each chunk is read alone, up to its damage.
                 for part in group:
@@ -216,16 +216,14 @@ class ChunkedFile(Container):
     def _read_ahead(self, remote: RemoteFile, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[ChunkPart]:
         """Yield the parts of the chunks of a distant file; threads read the wanted bytes of the next parts."""
 
-        def located(span: tuple[list[Chunk], int, int]) -> list[ChunkPart]:
+        def locate(span: tuple[list[Chunk], int, int]) -> list[ChunkPart]:
             group, begin, end = span
             if 0 < end - begin <= 2 * LARGEST_CHUNK_BYTES:
                 remote.hold(begin, end - begin)
             return [self._locate_part(chunk, wanted) for chunk in group]
 
         spans = _group_spans(chunks, wanted)
-        for _, parts in work_ahead(
-            located, spans, READERS, SPANS_AHEAD, lambda span: (span[2] - span[1]) / BYTES_AHEAD
-        ):
+        for _, parts in work_ahead(locate, spans, READERS, SPANS_AHEAD, lambda span: (span[2] - span[1]) / BYTES_AHEAD):
             yield from parts()
 
     def _locate_part(self, chunk: Chunk, wanted: frozenset[int]) -> ChunkPart:
@@ -233,24 +231,24 @@ class ChunkedFile(Container):
 
         Without an index, and with a wrong index, the part has neither.
         """
-        chunk = self._with_header(chunk)
+        chunk = self._complete(chunk)
         if max(chunk.size, chunk.length, chunk.index_length) > LARGEST_CHUNK_BYTES:
             return ChunkPart(chunk)
-        is_partly, by_message = chunk.is_partly(wanted), chunk.is_partly(wanted) and chunk.is_stored
+        is_partly, by_message = chunk.is_partly(wanted), chunk.is_partly(wanted) and chunk.is_uncompressed
         held, behind = None, chunk.at + chunk.length
         if self._remote is not None:
             self.mixed |= is_partly and not by_message
             begin = behind if by_message else chunk.at
             held = self._remote.hold(begin, behind + chunk.index_length - begin)
-        places, channels = self._message_index(self._source.read_at(behind, chunk.index_length))
-        order = np.argsort(places, kind="stable")
-        begins = places[order]
+        offsets, channels = self._message_index(self._source.read_at(behind, chunk.index_length))
+        order = np.argsort(offsets, kind="stable")
+        begins = offsets[order]
         ends = np.append(begins[1:], chunk.size)
         if not len(begins) or (ends <= begins).any():
             return ChunkPart(chunk, held=held)
         is_wanted = np.isin(channels, list(wanted))[order] if is_partly else np.ones(len(begins), np.bool_)
         sizes = (ends - begins)[is_wanted]
-        in_part = is_partly and (chunk.is_stored or self._unpacks_parts)
+        in_part = is_partly and (chunk.is_uncompressed or self._unpacks_parts)
         if not (in_part and 0 < sizes.sum() < SMALL_PART * chunk.size):
             return ChunkPart(chunk, begins, held=held)
         first, last = begins[is_wanted], ends[is_wanted]
@@ -289,7 +287,7 @@ class ChunkedFile(Container):
     def _unpack(self, part: ChunkPart, spaces: Buffers, target: Bytes, inflation: Inflation) -> int:
         """Write the wanted records of a chunk to `target`, and return their size [bytes].
 
-        A compressed chunk is read from its begin to the last wanted record, an uncompressed chunk from the first wanted
+        A compressed chunk is read from its start to the last wanted record, an uncompressed chunk from the first wanted
         record to the last.
 
         Raises
@@ -311,9 +309,9 @@ class ChunkedFile(Container):
                 target[: len(data)] = data
             return len(data)
         first, needed = int(part.ranges[0, 0]), int(part.ranges[1, -1])
-        if chunk.is_stored:
+        if chunk.is_uncompressed:
             begin = chunk.at + chunk.length - chunk.size + first
-            data = self._content(begin, needed - first, spaces.packed, part.held)
+            data = self._read_content(begin, needed - first, spaces.packed, part.held)
         else:
             # A whole frame is decompressed in one step.
             first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
@@ -341,7 +339,7 @@ class ChunkedFile(Container):
         known = [chunk for chunk in self._chunks or () if chunk.begin_ns]
         return (min(chunk.begin_ns for chunk in known), max(chunk.end_ns for chunk in known)) if known else None
 
-    def _content(self, at: int, length: int, space: Buffer, held: HeldBytes | None = None) -> Bytes:
+    def _read_content(self, at: int, length: int, space: Buffer, held: HeldBytes | None = None) -> Bytes:
         """Return `length` bytes of the file from `at` on; fewer at its end.
 
         Parameters
@@ -367,9 +365,9 @@ class ChunkedFile(Container):
     def _read_chunk(self, part: ChunkPart, spaces: Buffers) -> Generator[MessageBlock, None, bool]:
         """Yield the messages of a chunk, and return whether there were any; they then occupy the memory."""
         chunk = part.chunk
-        place = chunk.at - self._chunk_head
+        offset = chunk.at - self._chunk_head
         if chunk.size < 0:
-            self.report("log_parts_contradict", f"no chunk at byte {place}, where the index lists one")
+            self.report("log_parts_contradict", f"no chunk at byte {offset}, where the index lists one")
             return False
         self._at = min(chunk.at, self._size)
         try:
@@ -378,20 +376,20 @@ class ChunkedFile(Container):
             data = decompress(packed, spaces.records.take(packed.size + 1))
         except (DecompressionError, MemoryError) as err:
             if not chunk.is_cut:
-                self.report("log_damaged", f"chunk at byte {place} left out: {err}")
+                self.report("log_damaged", f"chunk at byte {offset} left out: {err}")
             return False
         stop, begin = 0, -1
         while begin < stop < len(data):
             begin = stop
-            block, stop = self._scanned(data, begin)
+            block, stop = self._scan(data, begin)
             yield block
         if stop < len(data) and not chunk.is_cut:
             self.report(
-                "log_damaged", f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged"
+                "log_damaged", f"chunk at byte {offset}: {len(data) - stop} of {len(data)} bytes left out, damaged"
             )
         return begin >= 0
 
-    def _scanned(self, data: Bytes, begin: int = 0) -> tuple[MessageBlock, int]:
+    def _scan(self, data: Bytes, begin: int = 0) -> tuple[MessageBlock, int]:
         """Return the messages among the records from `begin` on, and the byte behind the last record."""
         messages, others, stop = self._find_records(data, begin, None)
         for record in others if self._is_learning else ():
@@ -400,12 +398,12 @@ class ChunkedFile(Container):
 
 
 def _group_spans(chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[list[Chunk], int, int]]:
-    """Yield groups of chunks that one request reads, each with first byte and end of the range of this request."""
+    """Yield groups of chunks that one request reads, each with begin and end offset of the range of this request."""
     group: list[Chunk] = []
     begin = end = 0
     most = FIRST_SPAN_BYTES
     for chunk in chunks:
-        by_message = chunk.is_partly(wanted) and chunk.is_stored
+        by_message = chunk.is_partly(wanted) and chunk.is_uncompressed
         first, last = chunk.at, chunk.at + (0 if by_message else chunk.length + chunk.index_length)
         if group and not (end <= first <= end + NEAR_BYTES and last - begin <= most and last > first):
             yield group, begin, end

@@ -312,13 +312,13 @@ class Container(ABC):
         inside.
         """
         if wanted:
-            blocks = self._stored(wanted, cut)
+            blocks = self._yield_blocks(wanted, cut)
             if self.message_compression:
                 blocks = unpack_messages(blocks, wanted, self.message_compression, self.report)
             yield from blocks
 
     @abstractmethod
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
+    def _yield_blocks(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield the blocks of `blocks` before the decompression of single messages."""
 
     @abstractmethod

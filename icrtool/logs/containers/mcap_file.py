@@ -64,7 +64,7 @@ def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
 
     Parameters
     ----------
-    hint : (n,) first bytes of messages by the index, ascending; None without an index
+    hint : (n,) offsets of messages by the index, ascending; None without an index
     """
     starts, stop = record_starts(data, begin, hint, _behind_record, _message_ends)
     codes = data[starts]
@@ -106,7 +106,7 @@ def _message_heads(data: Bytes, at: Ints) -> NDArray[Any]:
 
 
 def _message_index(index: bytes) -> tuple[Ints, Ints]:
-    """Return the first bytes of the messages of a chunk in its records (n,), and their channels (n,).
+    """Return the offsets of the messages of a chunk in its records (n,), and their channels (n,).
 
     Both are empty where the index is damaged.
     """
@@ -144,7 +144,7 @@ class McapFile(ChunkedFile):
     _counts: dict[int, int]
     _described_bytes: int
 
-    def _described_channels(self) -> list[Channel]:
+    def _read_channels(self) -> list[Channel]:
         described = []
 
         @cache
@@ -297,7 +297,7 @@ class McapFile(ChunkedFile):
         if length <= LARGEST_CHUNK_BYTES:
             self._at = at
             piece = np.frombuffer(self._source.read_at(at, max(MCAP_PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
-            block, stop = self._scanned(piece)
+            block, stop = self._scan(piece)
             if stop:
                 return block, stop - _HEAD_BYTES
         self.report("log_damaged", f"record at byte {at} left out: damaged")
@@ -305,7 +305,7 @@ class McapFile(ChunkedFile):
 
     def _read_packed(self, part: ChunkPart, space: Buffer, needed: int = 0) -> PackedChunk:
         length = min(part.chunk.length, needed + _LARGEST_BLOCK_BYTES) if needed else part.chunk.length
-        content = self._content(part.chunk.at, length, space, part.held)
+        content = self._read_content(part.chunk.at, length, space, part.held)
         if len(content) < 40:
             raise DecompressionError("its header is cut off")
         size = int.from_bytes(content[16:24], "little")

@@ -360,7 +360,7 @@ class BagDirectory(Container):
             return None
         return min(begin for begin, _ in known), max(end for _, end in known)
 
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
+    def _yield_blocks(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels, file by file.
 
         Raises

@@ -73,7 +73,7 @@ class _Record(NamedTuple):
 
 
 def _fields(header: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yield the fields of a header: name, and first byte and end of the value."""
+    """Yield the fields of a header: name, and begin and end offset of the value."""
     end = 0
     while (begin := end + 4) <= len(header):
         end = begin + _LENGTH.unpack_from(header, begin - 4)[0]
@@ -87,7 +87,7 @@ def _header_fields(header: bytes) -> dict[bytes, bytes]:
 
 
 def _message_index(index: bytes) -> tuple[Ints, Ints]:
-    """Return the first bytes of the messages of a chunk in its records (n,), and their connections (n,).
+    """Return the offsets of the messages of a chunk in its records (n,), and their connections (n,).
 
     Both are empty where the index is damaged.
     """
@@ -110,7 +110,7 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
 
     Parameters
     ----------
-    hint : (n,) first bytes of messages by the index, ascending; None without an index
+    hint : (n,) offsets of messages by the index, ascending; None without an index
     """
     starts, stop = record_starts(data, begin, hint, _behind_record, _record_ends)
     sizes = values_at_each_byte(data, "<u4")[starts] + np.int64(8)
@@ -191,7 +191,7 @@ class Ros1Bag(ChunkedFile):
     _connections: dict[int, Channel]
     _described_bytes: int
 
-    def _described_channels(self) -> list[Channel]:
+    def _read_channels(self) -> list[Channel]:
         return list(self._connections.values())
 
     def _read_index(self) -> list[Chunk] | None:
@@ -207,8 +207,8 @@ class Ros1Bag(ChunkedFile):
             self.report("log_cut_off", "has no index (not closed, or cut off); read from start to end")
         return chunks
 
-    def _with_header(self, chunk: Chunk) -> Chunk:
-        if self._remote is not None and chunk.is_stored:
+    def _complete(self, chunk: Chunk) -> Chunk:
+        if self._remote is not None and chunk.is_uncompressed:
             self._remote.hold(chunk.at, _HEADER_BYTES)
         record = self._record(chunk.at)
         if record is None or record.op != _BAG_CHUNK:
@@ -298,7 +298,7 @@ class Ros1Bag(ChunkedFile):
         chunk = part.chunk
         if chunk.size < 0:
             raise DecompressionError("no chunk")
-        content = self._content(chunk.at, chunk.length, space, part.held)
+        content = self._read_content(chunk.at, chunk.length, space, part.held)
         size = len(content) if chunk.compression in STORED else chunk.size
         return PackedChunk(content, chunk.compression, size, partial=chunk.is_cut)
 

@@ -145,7 +145,7 @@ class SqliteBag(Container):
         first, last = (self._first_row(query.format(which)) or (None,) for which in ("min", "max"))
         return (first[0], last[0]) if isinstance(first[0], int) and isinstance(last[0], int) else None
 
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
+    def _yield_blocks(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted topics in the order in which they were stored."""
         self._interruption = None
 

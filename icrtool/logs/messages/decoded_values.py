@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.decoder import Decoder, text_numbers
+from icrtool.logs.messages.decoder import Decoder, text_codes
 from icrtool.logs.messages.definition_bounds import MOST_FIELDS, FieldNames
 from icrtool.logs.messages.definition_text import full_name
 from icrtool.logs.messages.definitions import (
@@ -73,16 +73,16 @@ class DecodedValues:
             return _padded(self.values[path], fill, dtype)
         return np.array(self.values[path], dtype)
 
-    def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
-        """Return the number of each text of a text field (n,) or (n, longest), -1 where a message lacks the text.
+    def text_codes(self, path: str, known: dict[bytes, int]) -> Ints:
+        """Return the code of each text of a text field (n,) or (n, longest), -1 where a message lacks the text.
 
         Parameters
         ----------
-        known : number of each text; texts that are not in it are added
+        known : code of each text, from 0; texts that are not in it are added
         """
         if "[*]" in path:
-            return _padded([text_numbers(texts, known) for texts in self.values[path]], -1, np.int64)
-        return np.array(text_numbers([*self.values[path]], known), np.int64)
+            return _padded([text_codes(texts, known) for texts in self.values[path]], -1, np.int64)
+        return np.array(text_codes([*self.values[path]], known), np.int64)
 
 
 @dataclass(slots=True)

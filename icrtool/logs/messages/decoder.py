@@ -77,23 +77,23 @@ class Shape(NamedTuple):
     ----------
     readable : whether the messages fit their layout
     size : smallest size of a message of this shape [bytes]; unreadable messages have exactly this size
-    same : offset and content of the bytes that decide the shape; None where they are too many to compare
-    big : whether numbers are big-endian
-    places : for each slot the offset of each number, or the offset and length of each text
+    deciding_bytes : offset and content of the bytes that decide the shape; None where they are too many to compare
+    is_big_endian : whether numbers are big-endian
+    offsets : for each slot the offset of each number, or the offset and length of each text
     """
 
     readable: bool
     size: int
-    same: tuple[tuple[int, bytes], ...] | None
-    big: bool
-    places: list[list[Any]]
+    deciding_bytes: tuple[tuple[int, bytes], ...] | None
+    is_big_endian: bool
+    offsets: list[list[Any]]
 
     def fits(self, message: bytes) -> bool:
         """Return whether a message has this shape."""
-        size, same = len(message), self.same
-        if same is None or not (size >= self.size if self.readable else size == self.size):
+        size, deciding = len(message), self.deciding_bytes
+        if deciding is None or not (size >= self.size if self.readable else size == self.size):
             return False
-        return all(message.startswith(content, at) for at, content in same)
+        return all(message.startswith(content, at) for at, content in deciding)
 
 
 class _ShapeReader:
@@ -104,74 +104,74 @@ class _ShapeReader:
         self._base = self._at = 4 if layout.cdr else 0
         self._steps_left = min(_STEPS_PER_BYTE * len(message) + _LEAST_STEPS + 2 * len(layout.program), _MOST_STEPS)
         # Encapsulation and lengths decide the shape; adjacent ranges of these bytes are joined.
-        self._same, self._lengths = [[0, self._base]], 0
-        self._places: list[list[Any]] = [[] for _ in range(layout.slot_count)]
-        self._big, readable = False, True
+        self._deciding, self._lengths = [[0, self._base]], 0
+        self._offsets: list[list[Any]] = [[] for _ in range(layout.slot_count)]
+        self._is_big_endian, readable = False, True
         try:
             if layout.cdr:
                 if len(message) < 4 or message[0] != 0 or message[1] > _CDR_LITTLE:
                     raise _UnreadableError
-                self._big = message[1] == _CDR_BIG
-            self._unpack = Struct(">I" if self._big else "<I").unpack_from
+                self._is_big_endian = message[1] == _CDR_BIG
+            self._unpack = Struct(">I" if self._is_big_endian else "<I").unpack_from
             self._run_program(layout.program, wanted=True)
         except _UnreadableError:
             readable = False
-        same = tuple((begin, message[begin:end]) for begin, end in self._same if message[begin:end])
+        deciding = tuple((begin, message[begin:end]) for begin, end in self._deciding if message[begin:end])
         self.shape = Shape(
             readable=readable,
             size=self._at if readable else len(message),
-            same=same if self._lengths <= _MOST_LENGTHS else None,
-            big=self._big,
-            places=self._places,
+            deciding_bytes=deciding if self._lengths <= _MOST_LENGTHS else None,
+            is_big_endian=self._is_big_endian,
+            offsets=self._offsets,
         )
 
     def _run_program(self, program: Sequence[Operation], *, wanted: bool) -> None:
-        """Pass over the fields of a program, and store the places of its wanted fields if `wanted`.
+        """Pass over the fields of a program, and store the offsets of its wanted fields if `wanted`.
 
         Raises
         ------
         _UnreadableError
             The message ends before its fields, or the program takes too many steps.
         """
-        for operation, size, count, slot, counter, body, is_constant in program:
+        for kind, size, stated_count, slot, counter, body, is_constant in program:
             self._steps_left -= 1
             if self._steps_left < 0:
                 raise _UnreadableError
-            number = self._read_length() if count == COUNTED else count
+            element_count = self._read_length() if stated_count == COUNTED else stated_count
             if counter >= 0 and wanted:
-                self._places[counter].append(self._at - 4)
-            if operation == TEXT:
-                if wanted and slot >= 0 and len(self._places[slot]) < MOST_TAKEN:
-                    length = number - 1 if self._cdr and number else number
-                    self._places[slot].append((self._at, min(length, LONGEST_TEXT)))
-                self._at += number
-            elif operation == NUMBERS:
-                if self._cdr and (number or count != COUNTED):
+                self._offsets[counter].append(self._at - 4)
+            if kind == TEXT:
+                if wanted and slot >= 0 and len(self._offsets[slot]) < MOST_TAKEN:
+                    length = element_count - 1 if self._cdr and element_count else element_count
+                    self._offsets[slot].append((self._at, min(length, LONGEST_TEXT)))
+                self._at += element_count
+            elif kind == NUMBERS:
+                if self._cdr and (element_count or stated_count != COUNTED):
                     self._at += (self._base - self._at) & (size - 1)
-                end = self._at + size * number
+                end = self._at + size * element_count
                 if end > self._stop:
                     raise _UnreadableError
                 if wanted and slot >= 0:
-                    stored, before = number, len(self._places[slot])
-                    if before or count == COUNTED:
-                        stored = min(number, MOST_ELEMENTS, MOST_TAKEN - before)
-                    self._places[slot] += range(self._at, self._at + size * stored, size)
+                    stored, before = element_count, len(self._offsets[slot])
+                    if before or stated_count == COUNTED:
+                        stored = min(element_count, MOST_ELEMENTS, MOST_TAKEN - before)
+                    self._offsets[slot] += range(self._at, self._at + size * stored, size)
                 self._at = end
             else:
-                self._run_loop(body, number, is_constant=is_constant, wanted=wanted)
+                self._run_loop(body, element_count, is_constant=is_constant, wanted=wanted)
 
-    def _run_loop(self, body: Sequence[Operation], number: int, *, is_constant: bool, wanted: bool) -> None:
-        """Pass over `number` elements, each with the fields of `body`; raise as `_run_program`."""
+    def _run_loop(self, body: Sequence[Operation], element_count: int, *, is_constant: bool, wanted: bool) -> None:
+        """Pass over `element_count` elements, each with the fields of `body`; raise as `_run_program`."""
         # Each element counts as one byte or more, so that a loop over elements without fields ends.
-        if number > self._stop - self._at:
+        if element_count > self._stop - self._at:
             raise _UnreadableError
         before = self._at, self._steps_left
-        for i in range(min(number, 2) if is_constant else number):
+        for i in range(min(element_count, 2) if is_constant else element_count):
             before = self._at, self._steps_left
             self._run_program(body, wanted=wanted and i < MOST_ELEMENTS)
-        if is_constant and number > 2:
-            self._at += (number - 2) * (self._at - before[0])
-            self._steps_left += (number - 2) * (self._steps_left - before[1])
+        if is_constant and element_count > 2:
+            self._at += (element_count - 2) * (self._at - before[0])
+            self._steps_left += (element_count - 2) * (self._steps_left - before[1])
             if self._at > self._stop or self._steps_left < 0:
                 raise _UnreadableError
 
@@ -182,15 +182,15 @@ class _ShapeReader:
         if self._at + 4 > self._stop:
             raise _UnreadableError
         self._lengths += 1
-        if self._same[-1][1] == self._at:
-            self._same[-1][1] += 4
+        if self._deciding[-1][1] == self._at:
+            self._deciding[-1][1] += 4
         elif self._lengths <= _MOST_LENGTHS:
-            self._same.append([self._at, self._at + 4])
-        number: int = self._unpack(self._message, self._at)[0]
+            self._deciding.append([self._at, self._at + 4])
+        length: int = self._unpack(self._message, self._at)[0]
         self._at += 4
-        if number > self._stop - self._at:
+        if length > self._stop - self._at:
             raise _UnreadableError
-        return number
+        return length
 
 
 @dataclass(slots=True)
@@ -199,14 +199,14 @@ class Decoder:
 
     Attributes
     ----------
-    layout : places of the wanted fields in the messages
+    layout : wanted fields of the messages, and the program that finds them
     types : primitive type of each column that the messages have
-    columns : class of the decoded messages
+    decoded_class : class of the decoded messages
     """
 
     layout: Layout
     types: Mapping[str, str] = field(default_factory=dict)
-    columns: type[Decoded] = field(default_factory=lambda: Decoded)
+    decoded_class: type[Decoded] = field(default_factory=lambda: Decoded)
     _known: list[Shape] = field(default_factory=list)
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> Decoded:
@@ -222,19 +222,19 @@ class Decoder:
             shape = next((known for known in self._known if known.fits(message)), None) if compare else None
             if shape is None:
                 shape = _ShapeReader(self.layout, message).shape
-                if len(self._known) < _COMPARED_SHAPES and shape.same is not None:
+                if len(self._known) < _COMPARED_SHAPES and shape.deciding_bytes is not None:
                     self._known.append(shape)
             fits = np.zeros(len(undecoded), np.bool_)
             fits[0] = True
-            if compare and shape.same is not None:
+            if compare and shape.deciding_bytes is not None:
                 fits = size[undecoded] >= shape.size if shape.readable else size[undecoded] == shape.size
                 together = values_at_each_byte(data, np.dtype((np.void, shape.size)))[start[undecoded[fits]]]
                 matches = np.ones(len(together), np.bool_)
-                for at, content in shape.same:
-                    matches &= as_first(together, at, len(content))
+                for at, content in shape.deciding_bytes:
+                    matches &= equals_first(together, at, len(content))
                 fits[fits] = matches
                 if not shapes and shape.readable and shape.size and fits.all():
-                    return self.columns(
+                    return self.decoded_class(
                         self.layout,
                         together.view(np.uint8),
                         np.arange(0, len(start) * shape.size, shape.size),
@@ -247,10 +247,12 @@ class Decoder:
             undecoded = undecoded[~fits]
         done = int(undecoded[0]) if len(undecoded) else len(start)
         readable = np.array([shape.readable for shape in shapes], np.bool_)[shape_of[:done]]
-        return self.columns(self.layout, data, start[:done][readable], shapes, shape_of[:done][readable], readable)
+        return self.decoded_class(
+            self.layout, data, start[:done][readable], shapes, shape_of[:done][readable], readable
+        )
 
 
-def as_first(records: NDArray[np.void], at: int, length: int) -> Bools:
+def equals_first(records: NDArray[np.void], at: int, length: int) -> Bools:
     """Return for each record (n,) whether its `length` bytes from `at` on equal the bytes of the first record.
 
     Notes
@@ -268,13 +270,13 @@ def as_first(records: NDArray[np.void], at: int, length: int) -> Bools:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Messages of one topic with the places of the wanted fields in them.
+    """Messages of one topic with the offsets of the wanted fields in them.
 
     Attributes
     ----------
     layout : wanted fields of the messages
     data : bytes of the messages
-    start : (n,) first byte of each readable message in `data`
+    start : (n,) offset at which each readable message begins in `data`
     shapes : the shapes of the messages
     shape_of : (n,) row in `shapes` of each readable message
     readable : (m,) whether each message could be decoded
@@ -292,11 +294,11 @@ class Decoded:
 
         Values that a message lacks are NaN or 0.
         """
-        name, number = self.layout.slots[path]
+        name, slot = self.layout.slots[path]
         letter = name[0] if name.startswith(("int", "float")) else "u"
         dtype: np.dtype[Any] = np.dtype(f"<{letter}{SIZES[name]}")
         result: np.dtype[Any] = np.dtype(np.float64 if letter == "f" else np.int64)
-        offsets: list[list[int]] = [shape.places[number] if shape.readable else [] for shape in self.shapes]
+        offsets: list[list[int]] = [shape.offsets[slot] if shape.readable else [] for shape in self.shapes]
         width = max(map(len, offsets), default=0) if len(self.start) else 0
         if width == 0:
             return np.empty((len(self.start), 0) if "[*]" in path else 0, result)
@@ -309,11 +311,11 @@ class Decoded:
             for row, row_offsets in zip(table, offsets, strict=True):
                 row[: len(row_offsets)] = row_offsets
             # A message that lacks the number may end too near to the end of the data to be read there.
-            places = np.minimum(self.start[:, None] + table[self.shape_of], len(self.data) - dtype.itemsize)
-            values = values_at_each_byte(self.data, dtype)[places]
-        if any(shape.big for shape in self.shapes):
-            big = np.array([shape.big for shape in self.shapes])
-            values = np.where(big[self.shape_of, None], values.byteswap(), values)
+            begins = np.minimum(self.start[:, None] + table[self.shape_of], len(self.data) - dtype.itemsize)
+            values = values_at_each_byte(self.data, dtype)[begins]
+        if any(shape.is_big_endian for shape in self.shapes):
+            is_big_endian = np.array([shape.is_big_endian for shape in self.shapes])
+            values = np.where(is_big_endian[self.shape_of, None], values.byteswap(), values)
         if dtype.char == "f":
             with np.errstate(invalid="ignore"):  # A signalling NaN becomes a quiet NaN.
                 values = values.astype(result, copy=False)
@@ -329,43 +331,43 @@ class Decoded:
         strides = (self.shapes[0].size, step)
         return np.ndarray((len(self.start), width), dtype, self.data, int(self.start[0]) + offset, strides)
 
-    def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
-        """Return the number of each text of a text field (n,) or (n, longest), -1 where a message lacks the text.
+    def text_codes(self, path: str, known: dict[bytes, int]) -> Ints:
+        """Return the code of each text of a text field (n,) or (n, longest), -1 where a message lacks the text.
 
         Parameters
         ----------
-        known : number of each text; texts that are not in it are added
+        known : code of each text, from 0; texts that are not in it are added
         """
-        slot = self.layout.slots[path]
+        slot = self.layout.slots[path].slot_index
         if not len(self.start):
             return np.empty((0, 0) if "[*]" in path else 0, np.int64)
-        width = max((len(shape.places[slot.number]) for shape in self.shapes if shape.readable), default=0)
-        numbers: Ints = np.empty((0, width), np.int64)
+        width = max((len(shape.offsets[slot]) for shape in self.shapes if shape.readable), default=0)
+        codes: Ints = np.empty((0, width), np.int64)
         for shape, rows in self.by_shape():
-            codes = []
-            for at, length in shape.places[slot.number]:
+            column_codes = []
+            for at, length in shape.offsets[slot]:
                 dtype = np.dtype((np.void, length))
                 texts = (
                     self._fields(at, dtype)[:, 0]
                     if len(self.shapes) == 1
                     else values_at_each_byte(self.data, dtype)[self.start[rows] + at]
                 )
-                are_equal = bool(as_first(texts, 0, length).all())
-                codes.append(text_numbers(texts[: 1 if are_equal else None].tolist(), known))
-            if len(self.shapes) == 1 and all(len(field_codes) == 1 for field_codes in codes):
-                numbers = np.broadcast_to(np.array(codes, np.int64).reshape(1, width), (len(self.start), width))
+                are_equal = bool(equals_first(texts, 0, length).all())
+                column_codes.append(text_codes(texts[: 1 if are_equal else None].tolist(), known))
+            if len(self.shapes) == 1 and all(len(field_codes) == 1 for field_codes in column_codes):
+                codes = np.broadcast_to(np.array(column_codes, np.int64).reshape(1, width), (len(self.start), width))
                 break
-            if not len(numbers):
-                numbers = np.full((len(self.start), width), -1, np.int64)
-            for column, field_codes in enumerate(codes):
-                numbers[rows, column] = field_codes
-        return numbers if "[*]" in path else numbers[:, 0]
+            if not len(codes):
+                codes = np.full((len(self.start), width), -1, np.int64)
+            for column, field_codes in enumerate(column_codes):
+                codes[rows, column] = field_codes
+        return codes if "[*]" in path else codes[:, 0]
 
     def texts(self, path: str) -> list[bytes]:
         """Return the text of a text field in each message (n,)."""
-        number, found = self.layout.slots[path].number, np.full(len(self.start), b"", object)
+        slot, found = self.layout.slots[path].slot_index, np.full(len(self.start), b"", object)
         for shape, rows in self.by_shape():
-            at, length = shape.places[number][0]
+            at, length = shape.offsets[slot][0]
             if length:
                 found[rows] = values_at_each_byte(self.data, np.dtype((np.void, length)))[
                     self.start[rows] + at
@@ -384,21 +386,20 @@ class Decoded:
                 yield shape, rows
 
 
-def text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
-    """Return the number of each text.
+def text_codes(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
+    """Return the code of each text, an integer from 0.
 
     Parameters
     ----------
-    known : number of each text; texts that are not in it are added, beyond `MOST_TEXTS` all under the number of
-        `FURTHER`
+    known : code of each text; texts that are not in it are added, beyond `MOST_TEXTS` all under the code of `FURTHER`
     """
     if len(known) + len(texts) <= MOST_TEXTS:
         return [known.setdefault(text, len(known)) for text in texts]
-    numbers = []
+    codes = []
     for text in texts:
         kept = text if text in known or len(known) < MOST_TEXTS else FURTHER
-        numbers.append(known.setdefault(kept, len(known)))
-    return numbers
+        codes.append(known.setdefault(kept, len(known)))
+    return codes
 
 
 @lru_cache(maxsize=64)

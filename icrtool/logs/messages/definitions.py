@@ -215,16 +215,16 @@ class Operation(NamedTuple):
     ----------
     kind : `NUMBERS`, `TEXT` or `LOOP`
     size : size of one number [bytes]
-    number : number of numbers or of elements, or `COUNTED`
-    slot : number of the slot for the values, -1 where they are passed over
-    counter : number of the slot for a counted number of elements, -1 where it is passed over
+    element_count : number of numbers or of elements, or `COUNTED`
+    slot : index of the slot for the values, -1 where they are passed over
+    counter : index of the slot for a counted number of elements, -1 where it is passed over
     body : operations for each element of a loop
     is_constant : the body counts nothing and has no slot, so that all elements but the first have the same size
     """
 
     kind: int
     size: int
-    number: int
+    element_count: int
     slot: int
     counter: int = -1
     body: tuple[Operation, ...] = ()
@@ -237,10 +237,10 @@ class Operation(NamedTuple):
 
 
 class Slot(NamedTuple):
-    """A wanted field: its primitive type (or ``string``), and its number."""
+    """A wanted field: its primitive type (or ``string``), and the index of its slot."""
 
     kind: str
-    number: int
+    slot_index: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,7 +321,7 @@ class _Compiler:
             self._add_skip(SIZES[primitive], 1)
 
     def _new_slot(self, path: str, primitive: str, count: int = 1) -> int:
-        """Return the number of a new slot for a field of up to `count` numbers or texts."""
+        """Return the index of a new slot for a field of up to `count` numbers or texts."""
         if path.count("[*]") > 2:
             raise DefinitionError(path, "a sequence in each element of a sequence of sequences is not read")
         nested = path.count("[*]") > 1
@@ -350,7 +350,7 @@ class _Compiler:
             self._add_skip(size, count)
 
     def _new_counter(self, path: str) -> int:
-        """Return the number of a new slot for the number of elements of a sequence, -1 where it is not wanted."""
+        """Return the index of a new slot for the number of elements of a sequence, -1 where it is not wanted."""
         return self._new_slot(f"{path}[#]", "uint32") if f"{path}[#]" in self._wanted else -1
 
     def _add_loop(self, path: str, element: int, inner: FieldDetail, count: int) -> None:
@@ -363,7 +363,7 @@ class _Compiler:
             self.add_message(inner, f"{path}.")
         self._loops -= 1
         body, self.program = tuple(self.program), outer
-        is_constant = all(operation.number != COUNTED and operation.slot < 0 for operation in body)
+        is_constant = all(operation.element_count != COUNTED and operation.slot < 0 for operation in body)
         is_constant = is_constant and all(operation.is_constant for operation in body if operation.kind == LOOP)
         self.program.append(Operation(LOOP, 0, count, -1, counter, body, is_constant))
 
@@ -372,8 +372,8 @@ class _Compiler:
         if not self.cdr:
             size, count = 1, size * count
         last = self.program[-1] if self.program else None
-        if last is not None and last[:2] == (NUMBERS, size) and last.number != COUNTED and last.slot < 0:
-            self.program[-1] = last._replace(number=last.number + count)
+        if last is not None and last[:2] == (NUMBERS, size) and last.element_count != COUNTED and last.slot < 0:
+            self.program[-1] = last._replace(element_count=last.element_count + count)
         else:
             self.program.append(Operation(NUMBERS, size, count, -1))
 

@@ -233,15 +233,15 @@ class TopicCollector:
     channel: Channel
     decoders: dict[int, MessageDecoder] = field(default_factory=dict)
     _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
-    _numbers: list[tuple[int, int]] = field(default_factory=list)
+    _stretches: list[tuple[int, int]] = field(default_factory=list)
     _columns: dict[tuple[str, bool], GrowingColumn] = field(default_factory=dict)
     _texts: dict[str, dict[bytes, int]] = field(default_factory=dict)
     _unreadable: int = 0
 
-    def feed(self, block: MessageBlock, number: int) -> None:
-        """Add the messages of a block whose channel has the id `number`."""
-        decoder, expected = self.decoders[number], self.channel.count or 0
-        unread = np.flatnonzero(block.channel == number)
+    def feed(self, block: MessageBlock, channel_id: int) -> None:
+        """Add the messages of a block whose channel has the id `channel_id`."""
+        decoder, expected = self.decoders[channel_id], self.channel.count or 0
+        unread = np.flatnonzero(block.channel == channel_id)
         while len(unread):
             chosen = unread[:_MESSAGES_AT_ONCE]
             decoded = decoder.decode(block.data, block.start[chosen], block.end[chosen])
@@ -251,11 +251,11 @@ class TopicCollector:
             if not len(readable):
                 continue
             self._times.add(block.log_time_ns[readable], expected)
-            self._numbers.append((number, len(readable)))
+            self._stretches.append((channel_id, len(readable)))
             for path, primitive in decoder.types.items():
                 values: NDArray[Any]
                 if is_text := primitive == "string":
-                    values = decoded.text_numbers(path, self._texts.setdefault(path, {}))
+                    values = decoded.text_codes(path, self._texts.setdefault(path, {}))
                 else:
                     values = decoded.numbers(path)
                 column = self._columns.setdefault((path, is_text), GrowingColumn(-1 if is_text else 0))
@@ -268,7 +268,7 @@ class TopicCollector:
         """
         times = self._times.rows()
         # The messages of one publisher may all be recorded later than the messages of another.
-        stored = [times] if len(self.decoders) == 1 else _split_by_channel(times, self._numbers, self.decoders)
+        stored = [times] if len(self.decoders) == 1 else _split_by_channel(times, self._stretches, self.decoders)
         step = max(map(find_backward_step, stored), default=NO_BACKWARD_STEP)
         order = None if (times[1:] >= times[:-1]).all() else np.argsort(times, kind="stable")
         columns: dict[str, NDArray[Any]] = {}
@@ -292,8 +292,8 @@ def _split_by_channel(times: Ints, stretches: list[tuple[int, int]], channels: I
     ----------
     stretches : for each block of messages its channel and the number of its messages, in the order of `times`
     """
-    numbers = np.repeat(*np.array(stretches, np.int64).reshape(-1, 2).T)
-    return [times[numbers == channel] for channel in channels]
+    channel_ids = np.repeat(*np.array(stretches, np.int64).reshape(-1, 2).T)
+    return [times[channel_ids == channel] for channel in channels]
 
 
 def find_backward_step(times: Ints) -> BackwardStep:
@@ -316,32 +316,32 @@ _NAMES, _INTERFACES, _VALUES = "joint_names[*]", "interface_values[*].interface_
 class JointColumns(Decoded):
     """Messages of DynamicJointState with the columns of a JointState; NaN where a joint lacks the interface."""
 
-    def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
-        """Return the number of each text of a text field, as `Decoded.text_numbers`; ``name[*]`` are the joints."""
-        return super().text_numbers(_NAMES if path == "name[*]" else path, known)
+    def text_codes(self, path: str, known: dict[bytes, int]) -> Ints:
+        """Return the code of each text of a text field, as `Decoded.text_codes`; ``name[*]`` are the joints."""
+        return super().text_codes(_NAMES if path == "name[*]" else path, known)
 
     def numbers(self, path: str) -> NDArray[Any]:
         """Return a field of the header (n,), or the values of the interface that a path names, of each joint (n, k)."""
         if path in self.layout.slots:
             return super().numbers(path)
         texts: dict[bytes, int] = {}
-        joints = self.text_numbers(_NAMES, texts).shape[1]
-        interfaces = self.text_numbers(f"{_INTERFACES}[*]", texts)
+        joints = self.text_codes(_NAMES, texts).shape[1]
+        interfaces = self.text_codes(f"{_INTERFACES}[*]", texts)
         values = self.numbers(f"{_VALUES}[*]")
         named, valued = (self.numbers(f"{of}[#]")[:, :joints] for of in (_INTERFACES, _VALUES))
         wanted, column = texts.get(path.removesuffix("[*]").encode(), -2), np.full((len(values), joints), np.nan)
         for _, rows_of_shape in self.by_shape():
-            # In messages of one shape each joint has the same number of interfaces, at the same places of the row.
+            # In messages of one shape each joint has the same number of interfaces, in the same columns.
             rows = np.arange(len(values))[rows_of_shape]
             names, numbers = named[rows[0]], valued[rows[0]]
             both = np.minimum(names, numbers)
             joint = np.repeat(np.arange(len(both)), both)
-            place = np.arange(len(joint)) - np.repeat(np.cumsum(both) - both, both)
-            name, value = ((np.cumsum(counts) - counts)[joint] + place for counts in (names, numbers))
+            rank = np.arange(len(joint)) - np.repeat(np.cumsum(both) - both, both)
+            name, value = ((np.cumsum(counts) - counts)[joint] + rank for counts in (names, numbers))
             is_read = (name < interfaces.shape[1]) & (value < values.shape[1])
             joint, name, value = joint[is_read], name[is_read], value[is_read]
-            row, place = np.nonzero(interfaces[np.ix_(rows, name)] == wanted)
-            column[rows[row], joint[place]] = values[rows[row], value[place]]
+            row, match = np.nonzero(interfaces[np.ix_(rows, name)] == wanted)
+            column[rows[row], joint[match]] = values[rows[row], value[match]]
         return column
 
 

@@ -281,12 +281,15 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     return _over_rows(partial(_bearing, level), ordered, norm), usable, notes
 
 
-def _over_rows(make: Callable[..., Floats], q: Sequence[Floats], norm: Floats | float = 1.0) -> Floats:
-    """Return a function (n,) of four columns divided by their norm, computed in parts to limit the memory."""
+def _over_rows(function: Callable[..., Floats], q: Sequence[Floats], norm: Floats | float = 1.0) -> Floats:
+    """Return `function` (n,) of the four columns, each divided by `norm`.
+
+    It is computed in parts of `ROWS_AT_ONCE` rows, to limit the memory.
+    """
     scaled, norms = np.empty(len(q[0])), np.broadcast_to(norm, len(q[0]))
     for lo in range(0, len(scaled), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE)
-        scaled[some] = make(*(field[some] / norms[some] for field in q))
+        rows = slice(lo, lo + ROWS_AT_ONCE)
+        scaled[rows] = function(*(column[rows] / norms[rows] for column in q))
     return scaled
 
 

@@ -104,7 +104,7 @@ def decoded(layout, data, start, end, at_once=1000):
         done += len(found.readable)
         for path, slot in layout.slots.items():
             if slot.kind == "string":
-                codes = found.text_numbers(path, known[path])
+                codes = found.text_codes(path, known[path])
                 texts = [*known[path], None]
                 parts[path] += [[texts[code] for code in np.atleast_1d(row)] for row in codes]
             else:
