@@ -99,7 +99,7 @@ def fit_log(
 
 
 def _giving_back(watch: Watch) -> Watch:
-    """Return a function that gives back freed memory at the begin of each stage, and then calls `watch`."""
+    """Return a function that gives back freed memory at the start of each stage, and then calls `watch`."""
 
     def begin(stage: str) -> None:
         give_back_freed()

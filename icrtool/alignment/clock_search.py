@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from icrtool.alignment.log_track import IMPOSSIBLE_M
-from icrtool.alignment.wheel_units import FASTER
+from icrtool.alignment.wheel_units import LEAST_RESTART_RATIO
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Floats, Ints, trapezoids, unwrapped
 from icrtool.records.measurements import Finding
@@ -213,7 +213,9 @@ class _Rates(NamedTuple):
         velocity = _rate(gnss.stamp_ns, gnss.north_m, log) + 1j * _rate(gnss.stamp_ns, gnss.east_m, log)
         speed, known = np.abs(velocity), _known(gnss.stamp_ns, log)
         # Jumps of the positions are left out, because their speeds would outweigh all others.
-        jumps = speed > FASTER * max(float(np.abs(side).max()) for side in (log.wheels.left, log.wheels.right))
+        jumps = speed > LEAST_RESTART_RATIO * max(
+            float(np.abs(side).max()) for side in (log.wheels.left, log.wheels.right)
+        )
         known, velocity = known & ~jumps, np.where(jumps, np.nan, velocity)
         # Slow motion is left out, because its course over ground is mostly noise.
         step = max(round(SPEED_OVER_S / GRID_S), 1)

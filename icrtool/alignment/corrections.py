@@ -186,8 +186,8 @@ def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bo
         (subject, lags, key), value = subjects[row], applied[row]
         if value != 0.0 and free[row]:
             fact = f"{subject} {lags} the wheels" if value > 0 else f"the wheels lag {subject}"
-            why = f"{fact} by {abs(value):.2f} ± {std_s[row]:.2f} s: corrected; {key} sets it{also}"
-            notes.append(note("delay_corrected", why))
+            text = f"{fact} by {abs(value):.2f} ± {std_s[row]:.2f} s: corrected; {key} sets it{also}"
+            notes.append(note("delay_corrected", text))
     return notes
 
 

@@ -146,7 +146,7 @@ def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
 def _losses(stamps: Ints, fixed: Bools) -> Ints:
     """Return the long spans without a fixed solution, from the last fixed fix before to the next fixed fix.
 
-    Fixes that are not fixed at the begin or the end of the log also make a span.
+    Fixes that are not fixed at the start or the end of the log also make a span.
     """
     rows = np.flatnonzero(fixed)
     edge = np.concatenate([[-1], rows, [len(stamps)]])

@@ -78,9 +78,14 @@ LONGEST_GYRO_STEP_S = 1.0
 LEAST_COURSE_STD_RAD = math.radians(0.05)
 """Smallest standard deviation of a course over ground [rad]."""
 
-ROUNDS, LONG_DELAY_S, LARGE_BIAS_RAD = 3, 0.15, math.radians(1.0)
-"""Largest number of linearisations, changes of the delay of the fixes [s] and of a window's turn by the bias [rad] from
-which on the courses are linearised again."""
+MOST_ROUNDS = 3
+"""Largest number of linearisations of the courses over ground."""
+
+LONG_DELAY_S = 0.15
+"""Change of the delay of the fixes [s] from which on the courses are linearised again."""
+
+LARGE_BIAS_RAD = math.radians(1.0)
+"""Change of a window's turn by the bias [rad] from which on the courses are linearised again."""
 
 MOST_SWEEPS = 3
 """Largest number of passes over the grids of noises."""
@@ -203,32 +208,32 @@ def estimate_heading(
         courses = measure_courses(track, turn, guess)
         if len(courses.end) < FEWEST_ALIGNMENT_WINDOWS:
             return None
-        problem = _Problem(courses, still, turn, ())
+        log_events = _LogEvents(courses, still, turn, ())
         if attempt:
             # The noises of turn rate and courses are chosen without the absolute headings.
-            noises = problem.choose(GYRO_NOISES, noises)
-        better = problem.guess(noises)._replace(middle=guess.middle)
+            noises = log_events.choose_noises(GYRO_NOISES, noises)
+        better = log_events.next_guess(noises)._replace(middle=guess.middle)
         turned = float(np.abs(better.bias - guess.bias).max() * np.median(courses.end - courses.begin))
         settled = turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S and has_middle
         if turned < LARGE_BIAS_RAD:
             # With a wrong bias, the lengths of the courses show the bias, because it bends the path.
             better, has_middle = better._replace(middle=fit_middle(courses, guess)), True
         guess = guess if settled else better
-        if settled or attempt == ROUNDS:
+        if settled or attempt == MOST_ROUNDS:
             break
         attempt += 1
     if absolute:
         if not settled:
             courses = measure_courses(track, turn, guess)
-        problem = _Problem(courses, still, turn, absolute)
+        log_events = _LogEvents(courses, still, turn, absolute)
         grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
-        noises = problem.choose(grids, noises)
+        noises = log_events.choose_noises(grids, noises)
     if absolute and math.isfinite(absolute[0].aligned_std):
-        offset, std = problem.offset(noises)
+        offset, std = log_events.offset(noises)
         if abs(offset) <= EVIDENCE_SIGMAS * std:
             # If the offset is not significant, the sensor counts as mounted along the robot.
-            problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
-    return problem.solve(noises)
+            log_events.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
+    return log_events.estimate(noises)
 
 
 def _standing(track: Track, turn: TurnRate) -> tuple[Floats, Floats]:
@@ -238,26 +243,36 @@ def _standing(track: Track, turn: TurnRate) -> tuple[Floats, Floats]:
     gone = track.cumulate(np.abs(track.v_left) + np.abs(track.v_right))
     still = np.interp(end, track.t, gone) - np.interp(begin - STANDING_S, track.t, gone) < 1e-3
     still &= (end - begin < 1.5 * STANDING_S) & (begin >= turn.t[0]) & (end <= turn.t[-1])
-    G = turn.integrated
-    rate = (np.interp(end, turn.t, G) - np.interp(begin, turn.t, G)) / (end - begin)
+    rate = (np.interp(end, turn.t, turn.integrated) - np.interp(begin, turn.t, turn.integrated)) / (end - begin)
     return end[still], rate[still]
 
 
-class _Problem:
-    """The events of a log, in order of time, as functions of their unknown noises."""
+class _LogEvents:
+    """The events of a log, in order of time, as functions of their unknown noises.
+
+    Attributes
+    ----------
+    turn : the turn rate
+    absolute : the absolute headings
+    integrated_rate_rad : integral of the turn rate, at its samples [rad]
+    t : (n,) times of the events [s]
+    kind : (n,) kind of each event: `COURSE`, `STANDSTILL`, `NOTHING`, or `ABSOLUTE` plus the number of the heading
+    turned_rad : (n,) integral of the turn rate, at the events [rad]
+    as_stated : the events with the variances that the sources state
+    """
 
     def __init__(
         self, courses: Courses, still: tuple[Floats, Floats], turn: TurnRate, absolute: Sequence[AbsoluteHeading]
     ) -> None:
-        self.turn, self.absolute, self.G = turn, absolute, turn.integrated
+        self.turn, self.absolute, self.integrated_rate_rad = turn, absolute, turn.integrated
         still_t, still_rate = still
         t = np.concatenate([courses.end, still_t, *(sensor.t for sensor in absolute)])
         # Events without a measurement fill long gaps between events.
-        at = np.sort(t)
-        far = np.flatnonzero(np.diff(at) > 2.0 * LONGEST_GYRO_STEP_S)
+        ordered = np.sort(t)
+        long_gaps = np.flatnonzero(np.diff(ordered) > 2.0 * LONGEST_GYRO_STEP_S)
         steps = [
-            np.arange(at[i] + LONGEST_GYRO_STEP_S, at[i + 1] - 0.5 * LONGEST_GYRO_STEP_S, LONGEST_GYRO_STEP_S)
-            for i in far
+            np.arange(ordered[i] + LONGEST_GYRO_STEP_S, ordered[i + 1] - 0.5 * LONGEST_GYRO_STEP_S, LONGEST_GYRO_STEP_S)
+            for i in long_gaps
         ]
         nothing = np.zeros(sum(map(len, steps)))
         t = np.concatenate([t, *steps])
@@ -271,7 +286,7 @@ class _Problem:
         h[kind == STANDSTILL, BIAS] = 1.0
         rows = kind == COURSE
         h[rows, BIAS], h[rows, SCALE], h[rows, X], h[rows, DELAY] = (
-            courses.of_bias, courses.of_scale, courses.of_x, courses.of_delay,
+            courses.bias_derivative, courses.scale_derivative, courses.x_derivative, courses.delay_derivative,
         )  # fmt: skip
         for i, sensor in enumerate(absolute):
             rows, first = kind == ABSOLUTE + i, STATES_OF_A_SOURCE * i
@@ -285,24 +300,28 @@ class _Problem:
             nothing + 1.0,
         ]
         self.t, self.kind, h = t[order], kind[order], h[order]
-        self.at = np.interp(self.t, turn.t, self.G)
-        elapsed, turned = (np.diff(column, prepend=column[:1]) for column in (self.t, self.at))
+        self.turned_rad = np.interp(self.t, turn.t, self.integrated_rate_rad)
+        elapsed, turned = (np.diff(column, prepend=column[:1]) for column in (self.t, self.turned_rad))
         holes = np.diff(turn.hole_variance(self.t), prepend=0.0)
         variance = np.concatenate(std)[order] ** 2
-        self.stated = HeadingEvents(elapsed, turned, holes, z[order], h, variance, angle=h[:, ANGLE] > 0.0)
+        self.as_stated = HeadingEvents(elapsed, turned, holes, z[order], h, variance, angle=h[:, ANGLE] > 0.0)
 
-    def events(self, noises: dict[str, float], alike: float = 1.0, count: int | None = None) -> HeadingEvents:
+    def events(
+        self, noises: dict[str, float], correlated_courses: float = 1.0, count: int | None = None
+    ) -> HeadingEvents:
         """Return the events, or the first `count` of them, with the variances of some noises.
 
         Parameters
         ----------
-        alike : number of courses over ground that count as one, because their errors are correlated
+        correlated_courses : number of courses over ground that count as one, because their errors are correlated
         """
-        stated, kind = self.stated.cut(count), self.kind[:count]
-        of_course = noises["fixes"] ** 2 * stated.r + (noises["slip"] * stated.h[:, X]) ** 2 + LEAST_COURSE_STD_RAD**2
+        stated, kind = self.as_stated.cut(count), self.kind[:count]
+        course_variance = (
+            noises["fixes"] ** 2 * stated.r + (noises["slip"] * stated.h[:, X]) ** 2 + LEAST_COURSE_STD_RAD**2
+        )
         white = np.ones(ABSOLUTE + len(self.absolute))
         white[ABSOLUTE:] = [noises[f"{i} white"] ** 2 for i in range(len(self.absolute))]
-        return stated._replace(r=np.where(kind == COURSE, alike * of_course, white[kind] * stated.r))
+        return stated._replace(r=np.where(kind == COURSE, correlated_courses * course_variance, white[kind] * stated.r))
 
     def model(self, noises: dict[str, float]) -> HeadingModel:
         """Return the initial state and the process noise of the states."""
@@ -311,20 +330,26 @@ class _Problem:
         std[SCALE], std[BIAS] = self.turn.scale_std, self.turn.bias_std
         x, q, decay = np.zeros(len(std)), np.zeros(len(std)), np.zeros(len(std))
         first = int(np.argmax(self.kind == COURSE))
-        x[ANGLE] = self.stated.z[first] - (self.at[first] - self.at[0])
+        x[ANGLE] = self.as_stated.z[first] - (self.turned_rad[first] - self.turned_rad[0])
         q[ANGLE], q[BIAS] = noises["angle"] ** 2, noises["bias"] ** 2
         for i in range(count):
             row = int(np.argmax(self.kind == ABSOLUTE + i))
-            at = STATES_OF_A_SOURCE * i
-            x[at + OFFSET] = math.remainder(self.stated.z[row] - x[ANGLE] - (self.at[row] - self.at[0]), 2 * math.pi)
+            first_state = STATES_OF_A_SOURCE * i
+            x[first_state + OFFSET] = math.remainder(
+                self.as_stated.z[row] - x[ANGLE] - (self.turned_rad[row] - self.turned_rad[0]), 2 * math.pi
+            )
             growth, size = noises[f"{i} rate"] ** 2, noises[f"{i} size"]
-            std[at + OFFSET] = self.absolute[i].offset_std
-            x[at + OFFSET] *= math.isinf(std[at + OFFSET])
-            std[at + OFFSET] = min(std[at + OFFSET], math.pi)
-            std[at + WANDER], decay[at + WANDER], q[at + WANDER] = size, growth / (2.0 * size**2), growth
+            std[first_state + OFFSET] = self.absolute[i].offset_std
+            x[first_state + OFFSET] *= math.isinf(std[first_state + OFFSET])
+            std[first_state + OFFSET] = min(std[first_state + OFFSET], math.pi)
+            std[first_state + WANDER], decay[first_state + WANDER], q[first_state + WANDER] = (
+                size,
+                growth / (2.0 * size**2),
+                growth,
+            )
         return HeadingModel(x, np.diag(std**2), q, decay, np.zeros(len(std), np.bool_))
 
-    def guess(self, noises: dict[str, float]) -> Guess:
+    def next_guess(self, noises: dict[str, float]) -> Guess:
         """Return the errors at which the courses are linearised next."""
         events, model = self.events(noises), self.model(noises)
         states, covariances = smooth_headings(events, model, filter_headings(events, model))
@@ -332,7 +357,7 @@ class _Problem:
         bias_std, scale_std = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))[[BIAS, SCALE]]
         return Guess(bias, float(bias_std), float(scale_std), float(states[-1, X]), float(states[-1, DELAY]))
 
-    def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
+    def choose_noises(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
         """Return the noises; each in `grids` is set, one after the other, to its value of largest likelihood."""
         noises = {name: float(values[len(values) // 2]) for name, values in grids.items()} | noises
 
@@ -358,9 +383,9 @@ class _Problem:
         course = self.kind == COURSE
         z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
         # The first innovations are large because the states are not known yet.
-        alike = float(long_run_factor(z[len(z) // 20 + 2 :, None])[0])
-        if alike > 1.0:
-            events = self.events(noises, alike)
+        correlated_courses = float(long_run_factor(z[len(z) // 20 + 2 :, None])[0])
+        if correlated_courses > 1.0:
+            events = self.events(noises, correlated_courses)
             passes = filter_headings(events, model)
         return events, model, passes
 
@@ -369,7 +394,7 @@ class _Problem:
         passes = self._forward(noises)[2]
         return math.remainder(passes.x[-1, OFFSET], 2.0 * math.pi), math.sqrt(passes.P[-1, OFFSET, OFFSET])
 
-    def solve(self, noises: dict[str, float]) -> HeadingEstimate:
+    def estimate(self, noises: dict[str, float]) -> HeadingEstimate:
         """Return the estimate for given noises."""
         events, model, passes = self._forward(noises)
         states, covariances = smooth_headings(events, model, passes)
@@ -382,25 +407,25 @@ class _Problem:
         psi_variance, final_std = covariances[:, ANGLE, ANGLE].copy(), np.sqrt(np.diagonal(covariances[-1]))
         del covariances
         passes = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
-        causal, of_causal = passes.x, passes.P
+        causal, causal_covariance = passes.x, passes.P
         del passes, events  # This frees memory for the arrays at each sample.
-        t, turn, turned_by_rate = self.t, self.turn, self.G
+        t, turn, turned_by_rate = self.t, self.turn, self.integrated_rate_rad
         # The heading at samples of the rate: causal from the last event on, smoothed between events.
         interval_s = float(np.median(np.diff(turn.t), overwrite_input=True))
         every = max(1, round(1.0 / (LARGEST_RATE_HZ * interval_s)))
         rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))[::every]
         s = turn.t[rows]
         last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
-        dt, turned_since = s - t[last], turned_by_rate[rows] - self.at[last]
+        dt, turned_since = s - t[last], turned_by_rate[rows] - self.turned_rad[last]
         psi, scale, bias = (causal[last, state] for state in (ANGLE, SCALE, BIAS))
         carried = psi + (1 + scale) * turned_since - bias * dt
         variance = noises["angle"] ** 2 * dt
         f = {ANGLE: np.ones(len(rows)), BIAS: -dt, SCALE: turned_since}
         for i, j in product(f, f):
-            variance += f[i] * of_causal[last, i, j] * f[j]
+            variance += f[i] * causal_covariance[last, i, j] * f[j]
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
         gain = 1 + states[-1, SCALE]
-        smoothed = gain * turned_by_rate[rows] + np.interp(s, t, states[:, ANGLE] - gain * self.at)
+        smoothed = gain * turned_by_rate[rows] + np.interp(s, t, states[:, ANGLE] - gain * self.turned_rad)
         # A rate may be the mean over the interval before or after its stamp.
         delay_s = interval_s / 2.0 if turn.delay_std_s is None else turn.delay_std_s
         stamp = (turn.rate[rows] * delay_s) ** 2

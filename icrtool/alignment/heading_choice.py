@@ -298,7 +298,7 @@ def is_heading_known(t: Floats, std: Floats, holes: Floats) -> Bools:
     ----------
     t : (n,) stamps of the headings [s]
     std : (n,) standard deviations of the headings [rad]
-    holes : (m, 2) begins and ends of the holes of the turn rate [s]
+    holes : (m, 2) starts and ends of the holes of the turn rate [s]
     """
     clear = std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(std)))
     is_known, clear_rows = np.ones(len(t), np.bool_), np.flatnonzero(clear)

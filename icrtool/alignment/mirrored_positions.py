@@ -85,11 +85,11 @@ def with_right_positions(log: RobotLog, config: Config) -> RobotLog:
         # The offset of the heading decides between exchanges that fit equally well.
         _, exchange, corrected = min(near, key=lambda candidate: abs(candidate[0].offset_rad))
         witnesses = "gyro, heading and wheels, which agree"
-    why = (
+    text = (
         f"the positions turn in the opposite sense to {witnesses}: {exchange}; corrected "
         f"(twice the gain in log-likelihood {gain:.0f}, decisive from {DECISIVE:.0f} on)"
     )
-    return replace(corrected, notes=(*corrected.notes, note("positions_mirrored", why, log.name)))
+    return replace(corrected, notes=(*corrected.notes, note("positions_mirrored", text, log.name)))
 
 
 def _exchanged_by_distance(log: RobotLog, named: RobotLog) -> RobotLog:
@@ -117,11 +117,11 @@ def _exchanged_by_distance(log: RobotLog, named: RobotLog) -> RobotLog:
     gain = 2.0 * min(sent.spans, back.spans) * math.log(ratio)
     if not gain > DECISIVE:
         return log
-    why = (
+    text = (
         "the distances of the positions fit the wheels' in all directions where latitude and longitude are exchanged: "
         f"corrected (twice the gain in log-likelihood {gain:.0f}, decisive from {DECISIVE:.0f} on)"
     )
-    return replace(other, notes=(*other.notes, note("positions_mirrored", why, log.name)))
+    return replace(other, notes=(*other.notes, note("positions_mirrored", text, log.name)))
 
 
 def _with_turned_heading(log: RobotLog) -> RobotLog:

@@ -176,8 +176,8 @@ def without_bad_start(log: RobotLog) -> RobotLog:
         return log
     count = int(jumps[-1]) + 1
     rows = slice(count, None)
-    why = f"{count} of the first fixes lie {step[jumps].max():.4g} m from the others: left out"
-    return replace(log, gnss=gnss.cut(rows), notes=(*log.notes, note("first_fixes_apart", why, log.name)))
+    text = f"{count} of the first fixes lie {step[jumps].max():.4g} m from the others: left out"
+    return replace(log, gnss=gnss.cut(rows), notes=(*log.notes, note("first_fixes_apart", text, log.name)))
 
 
 def without_frozen(log: RobotLog) -> RobotLog:
@@ -197,8 +197,8 @@ def without_frozen(log: RobotLog) -> RobotLog:
         return log
     keep = ~np.repeat(old, count)
     keep[first] = True
-    why = f"{np.count_nonzero(~keep)} fixes repeat the fix before to the last digit while the wheels move: left out"
-    return replace(log, gnss=gnss.cut(keep), notes=(*log.notes, note("fixes_frozen", why, log.name)))
+    text = f"{np.count_nonzero(~keep)} fixes repeat the fix before to the last digit while the wheels move: left out"
+    return replace(log, gnss=gnss.cut(keep), notes=(*log.notes, note("fixes_frozen", text, log.name)))
 
 
 LARGEST_SANE_GNSS_STD_M, LARGEST_SANE_HEADING_STD_RAD = 100.0, math.radians(60.0)

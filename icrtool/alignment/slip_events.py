@@ -82,7 +82,7 @@ LOST_EVIDENCE = 8.0
 CLEAR_STEP = 2.0
 """Missing motion of a step, in standard deviations, from which on it shows where in the step an event begins."""
 
-CHUNK = 64
+CHUNK_STEPS = 64
 """Number of steps that are evaluated together while an event grows."""
 
 
@@ -172,9 +172,9 @@ def _find_events(
             continue
         free[extent.first : extent.last] = False
         outside[max(extent.first - 1, 0) : extent.last + 2] = False
-        far = float(distance2[at])
+        largest2 = float(distance2[at])
         # Probability of a larger value of chi-squared with 3 degrees of freedom.
-        tail = math.erfc(math.sqrt(far / 2)) + math.sqrt(2 * far / math.pi) * math.exp(-far / 2)
+        tail = math.erfc(math.sqrt(largest2 / 2)) + math.sqrt(2 * largest2 / math.pi) * math.exp(-largest2 / 2)
         events.append(
             SlipEvent(
                 kind=extent.kind,
@@ -217,7 +217,7 @@ def _weigh(
     # A robot that stands still is rarer than slip, and so is its opposite: twice the motion of the wheels.
     doubled = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
     doubled = np.maximum(doubled, np.abs(windows.turned - windows.model_turned))
-    still, twice = (far < IMMOBILISED_SHARE * windows.path_m for far in (windows.made, doubled))
+    still, twice = (length < IMMOBILISED_SHARE * windows.path_m for length in (windows.made, doubled))
     still_rate = _false_rate(windows, square, still, twice)
     other_rate = _false_rate(windows, square, ~beyond & ~still, beyond)
     return windows, square, np.where(still, still_rate, np.where(beyond, np.inf, other_rate)), error
@@ -429,7 +429,7 @@ def _growth(steps: ComparedWindows, error: Floats, shares: Floats, usable: Bools
     """Return the number of rows that belong to the event: up to the largest sum of evidence before it decreases."""
     total, best, count, done = 0.0, 0.0, 0, 0
     while done < len(rows):
-        chunk = rows[done : done + CHUNK]
+        chunk = rows[done : done + CHUNK_STEPS]
         low, high = min(chunk), max(chunk) + 1
         values = _evidence(steps.rows(slice(low, high)), error, shares)[:: rows.step]
         for value, fine in zip(values, usable[low:high][:: rows.step], strict=True):

@@ -174,7 +174,7 @@ def _ratios(largest_m: float) -> Floats:
 
 
 def spans_of_measured(measured_t: Floats, least_s: float, intervals: int) -> tuple[Floats, Floats]:
-    """Return begins and ends (w,) [s] of spans from one measured heading to another.
+    """Return starts and ends (w,) [s] of spans from one measured heading to another.
 
     Parameters
     ----------
@@ -233,13 +233,13 @@ def without_interpolated(log: RobotLog) -> RobotLog:
         straight, bend = straight & turn_straight, bend + turn_bend
     kept = _nodes(~straight, bend)
     apart_s = float(np.median(np.diff(t[kept])))
-    why = (
+    text = (
         f"the positions are interpolated: they lie on straight lines between nodes {apart_s:.2g} s apart, also where "
         f"the robot turns; the {len(kept)} nodes of {len(stamps)} positions are used"
     )
     rows = np.zeros(len(stamps), np.bool_)
     rows[kept] = True
-    finding = note("positions_interpolated", why, log.name)
+    finding = note("positions_interpolated", text, log.name)
     if same_stamps:
         heading = heading.cut(rows)
     elif turns:

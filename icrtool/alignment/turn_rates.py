@@ -70,7 +70,7 @@ class TurnRate:
     ----------
     t : (n,) stamps [s]
     rate : (n,) turn rate [rad/s]
-    holes : (m, 2) begins and ends of stretches [s] in which the rate was not measured
+    holes : (m, 2) starts and ends of stretches [s] in which the rate was not measured
     scale_std, bias_std : standard deviations of the rate's scale, and of its bias [rad/s], before the log
     hole_std : standard deviation of the rate within each hole (m,), or within all holes [rad/s]
     delay_std_s : standard deviation of the stamps [s]; None: half an interval
@@ -124,23 +124,23 @@ class Courses(NamedTuple):
     ----------
     begin, end : times of the first and of the last fix [s]
     angle : heading at the end, by the fixes [rad]
-    of_x, of_delay, of_bias, of_scale : derivatives of the angle by x_icr [rad/m], by the delay of the positions
-        [rad/s], by the bias of the turn rate [s] and by its scale error [rad]
+    x_derivative, delay_derivative, bias_derivative, scale_derivative : derivatives of the angle by x_icr [rad/m], by
+        the delay of the positions [rad/s], by the bias of the turn rate [s] and by its scale error [rad]
     std : standard deviation of the angle by the noise of the fixes [rad]
     length : ratio of the displacement by the fixes to the displacement by the wheels
-    of_middle : derivative of the length by `Guess.middle`
+    middle_derivative : derivative of the length by `Guess.middle`
     """
 
     begin: Floats
     end: Floats
     angle: Floats
-    of_x: Floats
-    of_delay: Floats
-    of_bias: Floats
-    of_scale: Floats
+    x_derivative: Floats
+    delay_derivative: Floats
+    bias_derivative: Floats
+    scale_derivative: Floats
     std: Floats
     length: Floats
-    of_middle: Floats
+    middle_derivative: Floats
 
 
 def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
@@ -182,18 +182,23 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     usable &= np.abs(laid_path[end] - laid_path[begin]) > 0.5 * length * (count - 1) / count
     usable &= track.clear(t[begin], t[end])
     usable &= np.searchsorted(turn.holes[:, 1], t[begin]) == np.searchsorted(turn.holes[:, 0], t[end])
-    of_x, of_delay = (product(centred(-signal)).imag / square for signal in (swing, speed * swing))
-    of_bias = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
-    of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
+    x_derivative, delay_derivative = (product(centred(-signal)).imag / square for signal in (swing, speed * swing))
+    bias_derivative = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
+    scale_derivative = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
     chord = laid_path[end] - laid_path[begin]
     travel, doubled = (laid(np.abs(v) * one) for one in (np.asarray(track.held, np.complex128), nose * unit))
     slip_std = _slip_std(chord, (travel[end] - travel[begin]).real, doubled[end] - doubled[begin])
     std = np.hypot(track.place_std_m / np.sqrt(square), slip_std)
     # The angle is stated for zero bias, zero x_icr and zero delay.
     bias_at = np.interp(t[end], turn.t, guess.bias)
-    angle = np.angle(displacement * swing[end]) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
+    angle = (
+        np.angle(displacement * swing[end])
+        + bias_at * bias_derivative
+        + guess.x * x_derivative
+        + guess.delay_s * delay_derivative
+    )
     courses = Courses(
-        t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, std,
+        t[begin], t[end], angle, x_derivative, delay_derivative, bias_derivative, scale_derivative, std,
         np.abs(displacement), product(centred(laid(u * nose))).real / square,
     )  # fmt: skip
     return Courses(*(values[usable] for values in courses))
@@ -217,7 +222,7 @@ def _slip_std(chord: Complexes, gone_m: Floats, doubled: Complexes) -> Floats:
 
 def fit_middle(courses: Courses, guess: Guess) -> float:
     """Return `Guess.middle` from the lengths of the courses: robust regression on the difference of the sides."""
-    x, y = courses.of_middle, courses.length
+    x, y = courses.middle_derivative, courses.length
     slope, weights, prior = 0.0, np.ones(len(x)), 0.0
     for _ in range(3):
         mean_x, mean_y = np.average(x, weights=weights), np.average(y, weights=weights)

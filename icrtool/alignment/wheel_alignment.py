@@ -34,9 +34,11 @@ from icrtool.records.tables import RobotLog
 SMALLEST_TURN_RAD = math.radians(20.0)
 """Smallest range of the heading at which the robot turned [rad]."""
 
-NEVER_MOVES_SHARE, DEAD_M = 0.02, 10.0
-"""Ratio of the sides' speeds below which, over this distance [m], the slower side has a dead encoder. No robot turns
-about one side for this distance."""
+NEVER_MOVES_SHARE = 0.02
+"""Ratio of the sides' distances below which the slower side has a dead encoder."""
+
+DEAD_M = 10.0
+"""Distance over which this ratio is compared [m]. No robot turns about one side for this distance."""
 
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the sample before, while moving, from which on the values count as held."""
@@ -169,8 +171,8 @@ def dead_or_copied(log: RobotLog) -> list[Note]:
         if (distance := gone[end] - gone[begin]) > DEAD_M:
             span = f"from {seconds[begin]:.0f} s to {seconds[end]:.0f} s, while the others go {distance:.0f} m"
             meaning = "if so, do not use the ICRs: topics.wheels chooses others, --from and --to read the rest"
-            why = f"the {side} wheels hardly ever move {span}: is their encoder dead? {meaning}"
-            return [note("side_dead", why)]
+            text = f"the {side} wheels hardly ever move {span}: is their encoder dead? {meaning}"
+            return [note("side_dead", text)]
     if np.array_equal(left, right) and float(np.ptp(unwrapped(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
         cause = "one is a copy of the other, or the robot steers as a car does, and has no track ICRs"
         return [note("sides_equal", f"left and right wheels are equal throughout while the robot turns: {cause}")]
@@ -202,8 +204,8 @@ def align_wheels(
     share = float(same[moving].mean()) if np.count_nonzero(moving) >= FEWEST_ALIGNMENT_WINDOWS else 0.0
     if share > HELD_SHARE:
         rate = (1.0 - share) * 1e9 / float(np.median(np.diff(wheels.stamp_ns)))
-        why = f"wheel values are held: they change {rate:.1f} times a second while moving"
-        notes.append(note("wheel_values_held", why))
+        text = f"wheel values are held: they change {rate:.1f} times a second while moving"
+        notes.append(note("wheel_values_held", text))
     scale, std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
     windows = 0 if fit is None else len(fit.windows.begin)
     turn_unexplained, turn_unexplained_std = (math.nan, math.nan) if fit is None else unexplained_turn_variance(fit)

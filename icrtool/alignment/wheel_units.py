@@ -38,25 +38,42 @@ from icrtool.records.text import counted
 WELL_FITTED = 0.1
 """Largest misfit of the wheels' path between rare fixes at which its length is compared, `WheelPath.misfit`."""
 
-STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
-"""Spans in which the distances of wheels and position reference are compared: largest relative difference of the sides
-in straight spans and in bent spans, and largest change of direction in bent spans [rad]. Bent spans are used if there
-are too few straight ones."""
+LARGEST_STRAIGHT_DIFFERENCE = 0.1
+"""Largest relative difference of the sides' distances in the straight spans in which wheels and position reference are
+compared."""
+
+LARGEST_BENT_DIFFERENCE = 1.0
+"""Largest relative difference of the sides' distances in bent spans. They are used if too few spans are straight."""
+
+LARGEST_BEND_RAD = 1.2
+"""Largest change of direction in bent spans [rad]."""
 
 FASTEST_MPS = 100.0
 """Largest possible wheel speed [m/s]. A larger number is damaged, and would give any distance."""
 
-SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
-"""Smallest speed of a spike [m/s], its ratio to its neighbours and to the usual speed, and the quantile of the speeds
-that is the usual one. Such a single sample is not a motion of the robot."""
+LEAST_SPIKE_MPS = 3.0
+"""Smallest speed of a spike [m/s]. A spike is a single sample that is not a motion of the robot."""
 
-GAP_IN_USUAL, FASTER = 2.5, 1.5
-"""Shortest gap, in usual intervals, and smallest ratio of the speed in the gap to the speed in almost all other
-intervals, at which wheel positions began again because the base restarted."""
+LEAST_SPIKE_RATIO = 10.0
+"""Smallest ratio of a spike to its neighbours, and to the usual speed."""
 
-PARKED_M, PARKED_SIGMAS, TURNING_SHARE = 0.5, 3.0, 0.2
-"""Radius within which 95 % of a standing robot's positions lie, in metres and in their standard deviations, and
-smallest share of the time in which its wheels turn."""
+USUAL_QUANTILE = 0.995
+"""Quantile of the speeds that is the usual speed."""
+
+GAP_IN_USUAL = 2.5
+"""Shortest gap after which wheel positions may have begun again because the base restarted [usual intervals]."""
+
+LEAST_RESTART_RATIO = 1.5
+"""Smallest ratio of the speed in such a gap to the speed in almost all other intervals."""
+
+PARKED_M = 0.5
+"""Radius within which 95 % of a standing robot's positions lie [m]."""
+
+PARKED_SIGMAS = 3.0
+"""The same radius in standard deviations of the positions; the larger radius counts."""
+
+LEAST_TURNING_SHARE = 0.2
+"""Smallest share of the time in which the wheels of a standing robot turn."""
 
 UNIT_TOLERANCE = 0.35
 """Largest relative difference from the size by the reference at which a unit is recognised. Slip and soil change the
@@ -76,9 +93,11 @@ LARGEST_SIZE_STD = 0.04
 """Largest standard deviation of the factor of a wrong wheel size, as a share of it. Slip that varies gives a
 larger one."""
 
-STANDS_SHARE, STILL = 0.8, 0.2
-"""Share of the windows with a small displacement, and the largest ratio of a small displacement to the wheels', at
-which the robot does not move."""
+LEAST_STANDING_SHARE = 0.8
+"""Share of the windows with a small displacement above which the robot does not move."""
+
+LARGEST_STILL_RATIO = 0.2
+"""Largest ratio of a small displacement to the distance of the wheels."""
 
 
 class Scale(NamedTuple):
@@ -118,21 +137,21 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     if wheels.from_position and (again := _restarts(stamps, left, right)).any():
         restarts = stamps[again]
         left, right = (np.where(again, np.append(side[:1], side[:-1]), side) for side in (left, right))
-        why = f"{topic}: the wheel positions begin again in {counted(len(restarts), 'gap')}: the base restarted"
-        notes.append(note("wheel_positions_restart", f"{why}; what was driven there is not known"))
+        text = f"{topic}: the wheel positions begin again in {counted(len(restarts), 'gap')}: the base restarted"
+        notes.append(note("wheel_positions_restart", f"{text}; what was driven there is not known"))
     possible = (np.abs(left) <= FASTEST_MPS) & (np.abs(right) <= FASTEST_MPS)
     if not possible.all():
         count = np.count_nonzero(~possible)
-        why = f"{topic}: {count} wheel speeds over {FASTEST_MPS:.0f} m/s left out"
-        notes.append(note("wheel_speeds_impossible", why))
+        text = f"{topic}: {count} wheel speeds over {FASTEST_MPS:.0f} m/s left out"
+        notes.append(note("wheel_speeds_impossible", text))
         stamps, left, right = stamps[possible], left[possible], right[possible]
     if (spikes := _spikes(left) | _spikes(right)).any():
-        why = (
+        text = (
             f"{topic}: {np.count_nonzero(spikes)} wheel speeds, up to "
             f"{max(np.abs(left).max(), np.abs(right).max()):.0f} m/s, unlike those around them left out: "
             "were counters reset?"
         )
-        notes.append(note("wheel_speeds_impossible", why))
+        notes.append(note("wheel_speeds_impossible", text))
         stamps, left, right = stamps[~spikes], left[~spikes], right[~spikes]
     if len(stamps) < 2:
         raise DataError(log.name, f"{topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
@@ -230,13 +249,16 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
         turned = np.abs(windows.turned)
         apart = np.abs(windows.over(track.at_places(track.half_difference)))
         laid, went = np.abs(windows.laid), np.abs(windows.seen)
-        moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
+        moved = (went > LARGEST_STILL_RATIO * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
         clear = np.maximum(laid, apart) > windows.length_m / 4
-        if np.count_nonzero(clear) < FEWEST_ALIGNMENT_WINDOWS or float((~moved)[clear].mean()) <= STANDS_SHARE:
+        if np.count_nonzero(clear) < FEWEST_ALIGNMENT_WINDOWS or float((~moved)[clear].mean()) <= LEAST_STANDING_SHARE:
             return
         laid_m, went_m = float(laid[clear].sum()), float(went[clear].sum())
         gone = f" ({track.travel[-1]:.0f} m)"
-    elif not len(log.gnss.stamp_ns) or np.mean((log.wheels.left != 0.0) | (log.wheels.right != 0.0)) < TURNING_SHARE:
+    elif (
+        not len(log.gnss.stamp_ns)
+        or np.mean((log.wheels.left != 0.0) | (log.wheels.right != 0.0)) < LEAST_TURNING_SHARE
+    ):
         return
     place = log.gnss.north_m + 1j * log.gnss.east_m
     away = np.abs(place - (np.median(place.real) + 1j * np.median(place.imag)))
@@ -272,7 +294,9 @@ def _restarts(stamps: Ints, left: Floats, right: Floats) -> Bools:
     fastest = np.maximum(np.abs(left), np.abs(right))
     if not gap.any() or gap.all():
         return np.zeros(len(stamps), np.bool_)
-    return np.asarray(gap & (fastest > FASTER * float(np.quantile(fastest[~gap], USUAL_SHARE))) & (fastest > 0.0))
+    return np.asarray(
+        gap & (fastest > LEAST_RESTART_RATIO * float(np.quantile(fastest[~gap], USUAL_QUANTILE))) & (fastest > 0.0)
+    )
 
 
 def _spikes(speed: Floats) -> Bools:
@@ -281,8 +305,8 @@ def _spikes(speed: Floats) -> Bools:
     if len(size) < 2:
         return np.zeros(len(size), np.bool_)
     around = np.maximum(np.append(size[1], size[:-1]), np.append(size[1:], size[-2]))
-    usual = float(np.quantile(size, USUAL_SHARE))
-    spikes: Bools = (size > max(SPIKE_MPS, SPIKE_RATIO * usual)) & (size > SPIKE_RATIO * around)
+    usual = float(np.quantile(size, USUAL_QUANTILE))
+    spikes: Bools = (size > max(LEAST_SPIKE_MPS, LEAST_SPIKE_RATIO * usual)) & (size > LEAST_SPIKE_RATIO * around)
     return spikes
 
 
@@ -303,7 +327,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     left, right, chord = np.abs(left), np.abs(right), np.abs(step)
     distance, turn = (left + right) / 2, np.abs(left - right)
     usable = (np.abs(duration - usual_s) < usual_s / 4) & (chord > LEAST_CHORD_M) & (distance > 0)
-    straight = usable & (turn < STRAIGHT * distance)
+    straight = usable & (turn < LARGEST_STRAIGHT_DIFFERENCE * distance)
     path = wheel_path(track) if usual_s > CHORD_S else None
     if path is not None and path.misfit < WELL_FITTED:
         by_path = np.abs(np.diff(path.place[rows_of_chords(track)]))
@@ -314,7 +338,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
         bend[1:-1] = np.abs(np.angle(step[2:] * np.conj(step[:-2]))) / 2
         enclosed = usable.copy()
         enclosed[1:-1] &= usable[2:] & usable[:-2]
-        straight = enclosed & (turn < BENT * distance) & (bend < LARGEST_BEND_RAD)
+        straight = enclosed & (turn < LARGEST_BENT_DIFFERENCE * distance) & (bend < LARGEST_BEND_RAD)
         chord[straight] /= np.sinc(bend[straight] / 2 / math.pi)
     if np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:
         return None
@@ -337,12 +361,12 @@ def _metres_per_unit(
     nothing_given = config.wheels.unit == config.wheels.left_scale == config.wheels.right_scale == "auto"
     if unit == "rad" and radius is not None and not wheels.from_position and nothing_given:
         scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
-        far = scale is not None and scale.value > 0.0 and abs(math.log(scale.value / radius)) >= 2 * UNIT_TOLERANCE
+        is_other = scale is not None and scale.value > 0.0 and abs(math.log(scale.value / radius)) >= 2 * UNIT_TOLERANCE
         # Drivers fill speeds of joints in these units.
         for other, value in (("m/s", 1.0), ("rpm", 2 * math.pi * radius / 60), ("deg/s", math.radians(radius))):
-            if scale is not None and far and abs(math.log(scale.value / value)) < OTHER_UNIT_TOLERANCE:
-                why = f"{topic} is read in {other}, not rad/s: the position reference goes as far in this unit"
-                return value, f" in {other} (by the position reference)", [note("wheel_unit_found", why)]
+            if scale is not None and is_other and abs(math.log(scale.value / value)) < OTHER_UNIT_TOLERANCE:
+                text = f"{topic} is read in {other}, not rad/s: the position reference goes as far in this unit"
+                return value, f" in {other} (by the position reference)", [note("wheel_unit_found", text)]
     if unit in metres_by_unit:
         return metres_by_unit[unit], "" if unit == "m" else f" in {unit}{per}", []
     scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
@@ -366,12 +390,12 @@ def _metres_per_unit(
         )
     size = {"rad": "wheel radius", "counts": "travel of a count"}.get(unit, "travel of a unit of the wheels")
     estimate = f"{size} {_with_std(scale)} m (estimated from the position reference)"
-    why = (
+    reason = (
         f"{topic} names no unit, and none that is known fits (wheels.unit sets it)"
         if unit == "unknown"
         else f"{lacking} is not given"
     )
-    return scale.value, f", {estimate}", [note("wheel_unit_estimated", f"{why}: {estimate}")]
+    return scale.value, f", {estimate}", [note("wheel_unit_estimated", f"{reason}: {estimate}")]
 
 
 def _recognised(scale: Scale, known: Mapping[WheelUnit, float], radius: float | None) -> tuple[str, float] | None:

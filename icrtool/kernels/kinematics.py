@@ -114,7 +114,7 @@ def _arcs(heading: Floats, v_left: Floats, v_right: Floats, icrs: Floats, dt: Fl
 
     Parameters
     ----------
-    heading : (n,) at the begin [rad]; v_left, v_right : (n,) held [m/s]; dt : (n,) duration [s]
+    heading : (n,) at the start [rad]; v_left, v_right : (n,) held [m/s]; dt : (n,) duration [s]
     icrs : (n, 3) y_icr_right, y_icr_left, x_icr [m]
     """
     v_x, v_y, omega = body_velocity(v_left, v_right, *icrs.T)

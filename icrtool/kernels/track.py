@@ -216,7 +216,7 @@ class Windows:
 
     @cached_property
     def moved(self) -> Complexes:
-        """Displacement of the reference (w,), forward + j right in the body frame at the begin [m]."""
+        """Displacement of the reference (w,), forward + j right in the body frame at the start [m]."""
         return np.asarray(np.exp(-1j * self.track.heading_at(self.track.place_t[self.begin])) * self.seen)
 
     @cached_property

@@ -90,7 +90,7 @@ class LogFacts(Record, frozen=True, kw_only=True):
     antenna_is_known : the position of the antenna was configured, or is in the log
     clock_std_s : standard deviation of the time between position and heading, after the correction of delays [s]
     heading_common_std_rad : standard deviation of the error that all estimated headings share [rad]; 0: not estimated
-    heading_sensor : topic of the log that states a heading, also where it is fused with others; None without one
+    heading_sensor : topic of the log that states a heading, even where it is fused with others; None without one
     """
 
     heading_from_position: bool
@@ -193,7 +193,7 @@ class GroundStretch(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    begin_s, end_s : begin and end of the stretch since the first wheel sample [s]
+    begin_s, end_s : start and end of the stretch since the first wheel sample [s]
     multiplier, multiplier_std : turn of the wheels per turn of the robot, and its standard deviation
     """
 
@@ -333,7 +333,7 @@ class SlipEvent(Record, frozen=True):
     Attributes
     ----------
     begin_ns, end_ns : stamps of the wheel clock [ns]
-    north_m, east_m : position at the begin, in the local plane [m]
+    north_m, east_m : position at the start, in the local plane [m]
     distance_m : length of the robot's path through the event, by the position reference [m]
     severity : share of the wheels' motion that the robot did not make, 0 to 1
     confidence : probability that model error and sensor noise alone make no such event in the log

@@ -33,7 +33,7 @@ _FILE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
 NOT_REGULAR = "not a regular file"
-SAVE_IT = "save what it gives to a file, and name that"
+SAVE_IT = "save its output to a file, and pass that file"
 
 _URL = re.compile(r"^([a-z][a-z0-9+.-]+)://(?!/)", re.IGNORECASE)
 SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "http", "https")

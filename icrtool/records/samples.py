@@ -51,6 +51,8 @@ def without_repeats(column: Floats) -> Floats:
 
 
 WheelUnit = Literal["mps", "m", "rad", "counts", "unknown"]
+"""Unit of the speeds of the wheels. ``mps``: m/s, with the configured scales applied; ``m``: m/s as sent, without them;
+``rad`` and ``counts``: this unit per second; ``unknown``: the messages do not state a unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +79,24 @@ class WheelSamples(Samples):
 
     @property
     def v_left_mps(self) -> Floats:
-        """Speed of the left side [m/s], (n,)."""
+        """Speed of the left side [m/s], (n,).
+
+        Raises
+        ------
+        ValueError
+            The wheels are in another unit than m/s: align the log first.
+        """
         return self._in_mps(self.left)
 
     @property
     def v_right_mps(self) -> Floats:
-        """Speed of the right side [m/s], (n,)."""
+        """Speed of the right side [m/s], (n,).
+
+        Raises
+        ------
+        ValueError
+            The wheels are in another unit than m/s: align the log first.
+        """
         return self._in_mps(self.right)
 
     def _in_mps(self, speed: Floats) -> Floats:

@@ -9,4 +9,4 @@ Watch = Callable[[str], None]
 
 
 def unwatched(stage: str) -> None:
-    """Do nothing at the begin of a stage."""
+    """Do nothing at the start of a stage."""

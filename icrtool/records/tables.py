@@ -88,7 +88,7 @@ class RobotLog:
     gyros : all inertial units with turn rates, all axes
     other_receivers : further GNSS receivers
     other_references : the same log with each other position reference that it holds, and the heading of that reference
-    slipping_ns : (k, 2) begins and ends of the slip events in the log, in which the wheels do not show the motion
+    slipping_ns : (k, 2) starts and ends of the slip events in the log, in which the wheels do not show the motion
     heading_sensor : the topic that states the heading, None without a heading
     """
 

@@ -150,4 +150,4 @@ def test_a_pipe_or_a_device_is_refused_at_once(
     status, _, errors = icrtool(*(part.replace("FILE", str(file)).replace("LOG", str(LOG)) for part in command))
     assert status == 1
     assert "not a regular file" in errors
-    assert "save what it gives to a file" in errors
+    assert "save its output to a file" in errors

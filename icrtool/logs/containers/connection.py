@@ -248,7 +248,7 @@ def check_pace(began_s: float, received: int, quiet_s: float) -> None:
 
     Parameters
     ----------
-    began_s : time of `time.monotonic` at the begin of the request [s]
+    began_s : time of `time.monotonic` at the start of the request [s]
     received : number of bytes that were received
     quiet_s : time in which the server may send nothing [s]
 

@@ -189,7 +189,7 @@ class RemoteFile:
         """Return `count` bytes of the file from `at` on; fewer at its end."""
         end = min(at + count, self.size)
         if not self._ends:
-            # Readers of an index read the begin and the end of the file first.
+            # Readers of an index read the start and the end of the file first.
             begins = sorted({0, max(self.size - _LEAST_BYTES, 0)})
             self._ends = tuple(map(HeldBytes, begins, self._ranges(begins, [begin + _LEAST_BYTES for begin in begins])))
         held = next((held_bytes for held_bytes in (*self._ends, self._last.held) if held_bytes.has(at, end)), None)

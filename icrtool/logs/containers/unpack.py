@@ -200,7 +200,7 @@ _DECODING_ERRORS = (
 
 
 def _scratch_prefix() -> str:
-    """Return the begin of the names of the temporary folders of icrtool on this host."""
+    """Return the start of the names of the temporary folders of icrtool on this host."""
     return f"icrtool-{re.sub(r'[^A-Za-z0-9.]', '_', platform.node())[:64]}-"
 
 
@@ -536,7 +536,7 @@ class _FrugalFile:
             The offset is negative.
         """
         if whence == os.SEEK_SET and offset < 0:
-            raise zipfile.BadZipFile("its directory names an offset before the begin of the file")
+            raise zipfile.BadZipFile("its directory names an offset before the start of the file")
         return self._file.seek(offset, whence)
 
     def read(self, count: int = -1, /) -> bytes:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -132,76 +132,90 @@ def _unreadable_text(survey: Survey) -> str:
 def _assemble_choice(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     """Return the log with the streams of a choice, converted; raise as `assemble`."""
     candidates, name = survey.candidates, survey.name
-    motion, position, source = choice.wheels, choice.gnss, choice.heading
-    chosen: dict[Role, Source] = {"wheels": motion, "gnss": position}
-    if source is not None:
-        chosen["heading"] = source
-    retime, notes = _choose_clock(chosen, config)
-    chosen = {
-        role: replace(chosen_source, stamps=retime(chosen_source.stamps)) for role, chosen_source in chosen.items()
-    }
-    motion, position = replace(motion, stamps=retime(motion.stamps)), replace(position, stamps=retime(position.stamps))
-    source = None if source is None else replace(source, stamps=retime(source.stamps))
-    clock = common_clock([chosen_source.stamps for chosen_source in chosen.values()])
+    retime, notes = _choose_clock(choice, config)
+    wheel_source, position_source = _retimed(choice.wheels, retime), _retimed(choice.gnss, retime)
+    heading_source = None if choice.heading is None else _retimed(choice.heading, retime)
+    chosen: dict[Role, Source] = {"wheels": wheel_source, "gnss": position_source}
+    if heading_source is not None:
+        chosen["heading"] = heading_source
+    clock = common_clock([source.stamps for source in chosen.values()])
     if clock == "log":
-        far = "one stream has no header stamps, and the header stamps of another are far from log time"
-        notes.append(note("log_time_used", f"{far}; log time is used for all streams"))
-    notes += clock_notes([(role, chosen_source.stamps) for role, chosen_source in chosen.items()], name)
-    position, source, burst_notes = _spread_stamps(position, source, clock)
+        text = "one stream has no header stamps, and the header stamps of another are far from log time"
+        notes.append(note("log_time_used", f"{text}; log time is used for all streams"))
+    notes += clock_notes([(role, source.stamps) for role, source in chosen.items()], name)
+    position_source, heading_source, burst_notes = _spread_stamps(position_source, heading_source, clock)
     notes += burst_notes
-    notes += _datum_notes(position, config)
-    gnss, datum = _local_fixes(position, config, clock)
-    heading, convention = (NO_HEADINGS, "") if source is None else _convert_headings(source, config, clock)
-    wheels, wheel_notes = wheel_samples(motion, motion.stamps.on(clock), config, name)
-    notes += wheel_notes + ignored_joints(motion, config)
+    notes += _datum_notes(position_source, config)
+    gnss, datum = _local_fixes(position_source, config, clock)
+    heading, convention = (
+        (NO_HEADINGS, "") if heading_source is None else _convert_headings(heading_source, config, clock)
+    )
+    wheels, wheel_notes = wheel_samples(wheel_source, wheel_source.stamps.on(clock), config, name)
+    notes += wheel_notes + ignored_joints(wheel_source, config)
     notes += [
-        note(reported.code, f"{chosen_source.topic}: {reported.text}")
-        for chosen_source in chosen.values()
-        for reported in chosen_source.notes
+        note(reported.code, f"{source.topic}: {reported.text}")
+        for source in chosen.values()
+        for reported in source.notes
     ]
-    if source is None:
+    if heading_source is None:
         notes += [
             note("heading_unusable", f"{candidate.topic} gives no heading: {candidate.problem}")
             for candidate in candidates.heading
         ]
     notes += _unreadable_notes(survey.tables, chosen.values())
-    antenna = antenna_place(survey.tables, position.topic)
-    place = "" if antenna is None else f"antenna {antenna[0]:+z.2f} m forward, {antenna[1]:+z.2f} m right of the base"
+    antenna_m = antenna_place(survey.tables, position_source.topic)
+    antenna = (
+        "" if antenna_m is None else f"antenna {antenna_m[0]:+z.2f} m forward, {antenna_m[1]:+z.2f} m right of the base"
+    )
     read: dict[Role, tuple[Samples, str]] = {
         "wheels": (wheels, "; position" if wheels.from_position else "; speed"),
-        "gnss": (gnss, f"; {place} (/tf_static)" if place else ""),
+        "gnss": (gnss, f"; {antenna} (/tf_static)" if antenna else ""),
         "heading": (heading, f"; {convention}"),
     }
-    streams = tuple(_stream_choice(role, chosen_source, *read[role], clock) for role, chosen_source in chosen.items())
-    # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
-    others = [
-        receiver
-        for receiver in candidates.gnss
-        if receiver.geodetic is not None and not receiver.problem and receiver.topic != position.topic
-    ]
-    others = [replace(receiver, stamps=retime(receiver.stamps)) for receiver in others]
-    receivers = [
-        OtherReceiver(receiver.topic, _local_fixes(receiver, config, clock, datum)[0])
-        for receiver in others
-        if datum is not None
-    ]
-    rows_of_role: dict[str, StampedRows] = {
+    streams = tuple(_stream_choice(role, source, *read[role], clock) for role, source in chosen.items())
+    rows_of_topic: dict[str, StampedRows] = {
         table.topic: retime(stamp_rows(table)) for table in survey.tables if table.message_type == GYRO_TYPE
     }
-    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, rows_of_role)
-    gyros, degrees = _convert_gyros(inertial_units(survey.tables, GYRO_AXES, clock, rows_of_role), heading, gnss)
+    heading_topic = "" if heading_source is None else heading_source.topic
+    gyro = find_gyro(survey.tables, wheel_source.topic, heading_topic, clock, rows_of_topic)
+    gyros, degrees = _convert_gyros(inertial_units(survey.tables, GYRO_AXES, clock, rows_of_topic), heading, gnss)
     if gyro is not None and gyro.topic in degrees:
         gyro = replace(gyro, rate_radps=gyro.rate_radps * DEGREE)
     gyro = None if gyro is not None and is_too_fast(gyro.rate_radps[:, None]) else gyro
     notes += [
         note("gyro_in_degrees", f"{topic}: its turn rates are in deg/s, not rad/s: converted") for topic in degrees
     ]
+    receivers = _other_receivers(candidates.gnss, position_source.topic, retime, config, clock, datum)
     log = RobotLog(
-        name, wheels, gnss, heading, datum, streams, survey.inputs, dict(position.rejected),
-        (*survey.problems, *notes_about(name, notes)), antenna, gyro, gyros, tuple(receivers),
-        heading_sensor=None if source is None else _heading_sensor(source, config),
+        name, wheels, gnss, heading, datum, streams, survey.inputs, dict(position_source.rejected),
+        (*survey.problems, *notes_about(name, notes)), antenna_m, gyro, gyros, receivers,
+        heading_sensor=None if heading_source is None else _heading_sensor(heading_source, config),
     )  # fmt: skip
     return longest_part(log)
+
+
+AnySource = TypeVar("AnySource", bound=Source)
+"""Class of a source: wheels, positions or headings."""
+
+
+def _retimed(source: AnySource, retime: Callable[[StampedRows], StampedRows]) -> AnySource:
+    """Return a source with its stamps on the clock to use."""
+    return replace(source, stamps=retime(source.stamps))
+
+
+def _other_receivers(
+    sources: Iterable[PositionSource], chosen_topic: str, retime: Callable[[StampedRows], StampedRows], config: Config,
+    clock: Clock, datum: Datum | None,
+) -> tuple[OtherReceiver, ...]:  # fmt: skip
+    """Return the fixes of the other GNSS receivers, in the local plane of the chosen one; none without a datum."""
+    if datum is None:
+        return ()
+    others = (
+        _retimed(source, retime)
+        for source in sources
+        if source.geodetic is not None and not source.problem and source.topic != chosen_topic
+    )
+    return tuple(OtherReceiver(source.topic, _local_fixes(source, config, clock, datum)[0]) for source in others)
 
 
 def _unreadable_notes(tables: Iterable[TopicTable], chosen: Iterable[Source]) -> list[Note]:
@@ -229,9 +243,7 @@ def _stream_choice(role: Role, source: Source, samples: Samples, detail: str, cl
     )
 
 
-def _choose_clock(
-    chosen: Mapping[Role, Source], config: Config
-) -> tuple[Callable[[StampedRows], StampedRows], list[Note]]:
+def _choose_clock(choice: Choice, config: Config) -> tuple[Callable[[StampedRows], StampedRows], list[Note]]:
     """Return a function that puts stamps on the clock to use, and a finding about this clock.
 
     The clock is the configured one; with ``auto``, a clock of header stamps that all streams share is used.
@@ -243,24 +255,28 @@ def _choose_clock(
     """
     if config.topics.clock == "log":
         return use_log_times, []
+    sources = [source for source in (choice.wheels, choice.gnss, choice.heading) if source is not None]
     if config.topics.clock == "header":
-        for stream in chosen.values():
+        for stream in sources:
             if stream.stamps.header_ns is None and stream.stamps.far_ns is None:
                 why = f"{stream.topic} has no header stamps that can be used ({stream.stamps.note})"
                 raise ConfigError("topics.clock", why, "set it to auto or log")
         return use_header_stamps, []
-    far = [stream.stamps for stream in chosen.values() if stream.stamps.far_ns is not None]
-    others = [stream for stream in chosen.values() if stream.stamps.far_ns is None]
-    if share_clock(far) and all(stream.stamps.note == NO_HEADER for stream in others):
-        speed = replay_speed(far[0])
+    far_streams = [stream.stamps for stream in sources if stream.stamps.far_ns is not None]
+    others = [stream for stream in sources if stream.stamps.far_ns is None]
+    if share_clock(far_streams) and all(stream.stamps.note == NO_HEADER for stream in others):
+        speed = replay_speed(far_streams[0])
         pace = f", which runs {speed:.3g} times as fast as log time (a replay at that speed, or a simulation)"
         if not others:
             clock = f"one clock in all streams{pace if speed != 1.0 else ', such as simulated time'}"
-            return use_header_stamps, [note("header_clock", f"{far[0].note}, and come from {clock}: they are used")]
+            return use_header_stamps, [
+                note("header_clock", f"{far_streams[0].note}, and come from {clock}: they are used")
+            ]
         if speed != 1.0:
             without = ", ".join(stream.topic for stream in others)
-            why = f"{far[0].note}, and come from one clock{pace}: they are used, and {without} is put on that clock"
-            return lambda rows: put_on_replay_clock(rows, far[0]), [note("header_clock", why)]
+            clock = f"one clock{pace}"
+            text = f"{far_streams[0].note}, and come from {clock}: they are used, and {without} is put on that clock"
+            return lambda rows: put_on_replay_clock(rows, far_streams[0]), [note("header_clock", text)]
     return lambda rows: rows, []
 
 
@@ -404,8 +420,8 @@ def _datum_notes(source: PositionSource, config: Config) -> list[Note]:
         return []
     distance = f"frames.datum lies {far_m / 1e3:,.0f} km from the fixes ({latitude:.4f}, {longitude:.4f})"
     plane = f"its local plane is turned by {abs(math.degrees(turn)):.1f}° there"
-    why = f"{distance}, and {plane}: the first fix is the datum instead; correct frames.datum, [latitude, longitude]"
-    return [note("datum_far", why)]
+    text = f"{distance}, and {plane}: the first fix is the datum instead; correct frames.datum, [latitude, longitude]"
+    return [note("datum_far", text)]
 
 
 def _spread_stamps(
@@ -488,10 +504,11 @@ def longest_part(log: RobotLog) -> RobotLog:
             lost.append(f"{len(inside) - len(samples_kept.stamp_ns)} of {len(inside)} ({role})")
         longest_s = np.diff(samples_kept.stamp_ns).max(initial=0) / 1e9
         if longest_s > PAUSE_S:
-            why = "the recording was paused, or its clock was set forward"
-            paused.append(note("recording_paused", f"{role}: no samples for {longest_s:.0f} s: {why}"))
+            cause = "the recording was paused, or its clock was set forward"
+            paused.append(note("recording_paused", f"{role}: no samples for {longest_s:.0f} s: {cause}"))
     notes = paused[:1]
     if lost:
-        why = f"more than a day apart from the other samples, and left out: {', '.join(lost)}; if the clock was set, "
-        notes.insert(0, note("samples_days_apart", f"{why}--from and --to read that part"))
+        text = f"more than a day apart from the other samples, and left out: {', '.join(lost)}"
+        advice = "if the clock was set, --from and --to read that part"
+        notes.insert(0, note("samples_days_apart", f"{text}; {advice}"))
     return replace(log, notes=(*log.notes, *notes_about(log.name, notes)), **parts)

@@ -417,7 +417,9 @@ def ignored_joints(chosen: WheelSource, config: Config) -> list[Note]:
     """Return a finding for each configured list of joints that is not used because the messages list no joints."""
     if chosen.joints:
         return []
-    why = f"{chosen.topic} ({chosen.message_type}) lists no joints by name"
+    reason = f"{chosen.topic} ({chosen.message_type}) lists no joints by name"
     return [
-        note("joints_not_used", f"wheels.{key} is not used: {why}") for key in JOINT_KEYS if getattr(config.wheels, key)
+        note("joints_not_used", f"wheels.{key} is not used: {reason}")
+        for key in JOINT_KEYS
+        if getattr(config.wheels, key)
     ]

@@ -68,8 +68,8 @@ def average_wheels(
             turns_modulo = quantity == "position" and unit == "rad"
             means[quantity], stuck = _side_means([*map(unwind_turns, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
-    why = f"{listed([names[i] for i in sorted(dead)])} never turns, but the other wheels of its side do: left out"
-    notes = (note("wheel_dead", why),) if dead else ()
+    text = f"{listed([names[i] for i in sorted(dead)])} never turns, but the other wheels of its side do: left out"
+    notes = (note("wheel_dead", text),) if dead else ()
     return make_wheel_source(position=means["position"], speed=means["speed"], unit=unit, notes=notes, **others)
 
 
@@ -332,7 +332,7 @@ class Odometry(Twist):
         travelled = pose_travel(*(table.floats(path) for path in ODOMETRY_POSE))
         if travelled is None:
             return wheels
-        why = (
+        text = (
             f"{table.topic}: its twist stays 0 while its pose moves {travelled[-1, 0]:.1f} m forward: distance and "
             "turn of the pose are used as wheel odometry; topics.wheels sets another topic"
         )
@@ -340,7 +340,7 @@ class Odometry(Twist):
         words = "pose of the wheel odometry (its twist stays 0), converted to wheel speeds with the track width"
         return replace(
             wheels, travelled=travelled, score=score, why=words,
-            notes=(*wheels.notes, note("wheels_from_pose", why)),
+            notes=(*wheels.notes, note("wheels_from_pose", text)),
         )  # fmt: skip
 
 
