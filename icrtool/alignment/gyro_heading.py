@@ -78,7 +78,7 @@ LONGEST_GYRO_STEP_S = 1.0
 LEAST_COURSE_STD_RAD = math.radians(0.05)
 """Smallest standard deviation of a course over ground [rad]."""
 
-MOST_ROUNDS = 3
+MOST_LINEARISATIONS = 3
 """Largest number of linearisations of the courses over ground."""
 
 LONG_DELAY_S = 0.15
@@ -219,7 +219,7 @@ def estimate_heading(
             # With a wrong bias, the lengths of the courses show the bias, because it bends the path.
             better, has_middle = better._replace(middle=fit_middle(courses, guess)), True
         guess = guess if settled else better
-        if settled or attempt == MOST_ROUNDS:
+        if settled or attempt == MOST_LINEARISATIONS:
             break
         attempt += 1
     if absolute:
@@ -256,7 +256,7 @@ class _LogEvents:
     absolute : the absolute headings
     integrated_rate_rad : integral of the turn rate, at its samples [rad]
     t : (n,) times of the events [s]
-    kind : (n,) kind of each event: `COURSE`, `STANDSTILL`, `NOTHING`, or `ABSOLUTE` plus the number of the heading
+    kind : (n,) kind of each event, one of the four constants above
     turned_rad : (n,) integral of the turn rate, at the events [rad]
     as_stated : the events with the variances that the sources state
     """
