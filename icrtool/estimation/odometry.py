@@ -176,6 +176,8 @@ def measure_gaps(table: States, in_gap: Bools, sensors: SensorData, used: Bools)
     sensors : of the run; used : (m,) fixes that the filter used
     """
     rows, seen = np.flatnonzero(in_gap), sensors.fixes.cut(used)
+    if not (len(rows) and len(seen.stamp_ns)):
+        return GapPaths(rows, np.zeros(len(rows)), 0.0, 0.0)
     forward, right = sensors.facts.antenna_m
     heading = np.interp(seen.stamp_ns, sensors.headings.stamp_ns, unwrapped(sensors.headings.heading_rad))
     body = seen.north_m + 1j * seen.east_m - (forward + 1j * right) * np.exp(1j * heading)
@@ -189,7 +191,7 @@ def measure_gaps(table: States, in_gap: Bools, sensors: SensorData, used: Bools)
             length = np.abs(np.diff(path[chosen])).sum() + np.abs(path[-1] - path[chosen[-1]])
             beyond_m[gap] = max(float(length - np.abs(place[row + 1] - place[row])), 0.0)
         elif last < len(body):
-            # the filter follows the robot at the first fix after the gap
+            # The filter follows the robot at the first fix after the gap.
             after = int(np.searchsorted(table.stamp_ns, seen.stamp_ns[last]))
             driven = float(table.distance_m[min(after, len(table) - 1)] - table.distance_m[row + 1])
             moved = float(np.abs(body[last] - place[row])) - driven
