@@ -465,11 +465,11 @@ def _variance_stds(errors: Floats, stretches: int) -> tuple[float, float, float]
     return along, across, heading
 
 
-def _shares(missed: Floats, first: Floats, second: Floats) -> tuple[float, float]:
+def _shares(errors: Floats, first: Floats, second: Floats) -> tuple[float, float]:
     """Return a and b, at least `SMALLEST_VARIANCE`, for which a first^2 + b second^2 fits missed^2 by least squares."""
     columns = np.column_stack([first**2, second**2])
     a, b = np.maximum(
-        error_growth.solve_nonnegative(columns.T @ columns, columns.T @ missed**2), SMALLEST_VARIANCE
+        error_growth.solve_nonnegative(columns.T @ columns, columns.T @ errors**2), SMALLEST_VARIANCE
     ).tolist()
     return a, b
 
@@ -485,12 +485,12 @@ def _window_errors(table: HeldOut, name: str, length_m: float) -> tuple[Floats, 
     rows, stretches = [np.empty((0, 6))], set[tuple[int, float]]()
     for i, windows, predicted in _left_out_windows(table, name, [length_m]):
         path = predicted_path(table.recordings[i], *predicted, windows.track)
-        begin, end = (windows.track.place_t[at] for at in (windows.begin, windows.end))
-        (theta, turned), (place, moved) = (np.split(column, 2) for column in path(np.append(begin, end)))
-        error = np.exp(-1j * theta) * (moved - place) - windows.moved
+        begin, end = (windows.track.place_t[row] for row in (windows.begin, windows.end))
+        (theta, turned_theta), (position, moved) = (np.split(column, 2) for column in path(np.append(begin, end)))
+        error = np.exp(-1j * theta) * (moved - position) - windows.moved
         turn = windows.turned
-        off = turned - theta - turn
-        rows.append(np.column_stack([error.real, error.imag, off, end - begin, turn, windows.length_m]))
-        places = np.floor(windows.track.distance[windows.begin] / windows.length_m)
-        stretches.update((i, place) for place in places.tolist())
+        turn_error_rad = turned_theta - theta - turn
+        rows.append(np.column_stack([error.real, error.imag, turn_error_rad, end - begin, turn, windows.length_m]))
+        stretch_numbers = np.floor(windows.track.distance[windows.begin] / windows.length_m)
+        stretches.update((i, number) for number in stretch_numbers.tolist())
     return np.concatenate(rows), len(stretches)

@@ -43,20 +43,20 @@ _TO_DOCUMENT = np.array([math.degrees(1.0), -1.0, math.degrees(1.0), 1.0])
 
 
 def sensors_of(
-    recording: Recording, windows: Windows, fitted_model: FittedModel, turned: FittedModel | None = None
+    recording: Recording, windows: Windows, fitted_model: FittedModel, gyro_model: FittedModel | None = None
 ) -> documents.LogSensors:
     """Return the constants of a recording's sensors, with the corrections before the fit.
 
     Parameters
     ----------
     windows : windows of the recording
-    fitted_model, turned : models of the calibration, with wheels alone and with a gyro
+    fitted_model, gyro_model : models of the calibration, with wheels alone and with a gyro
     """
-    of_models = [
+    constants = [
         None if model is None else constants_document(measured_in(recording, windows, model))
-        for model in (fitted_model, turned)
+        for model in (fitted_model, gyro_model)
     ]
-    return documents.LogSensors(recording.heading_source, of_models[0] or documents.SensorConstants(), of_models[1])
+    return documents.LogSensors(recording.heading_source, constants[0] or documents.SensorConstants(), constants[1])
 
 
 def measured_in(recording: Recording, windows: Windows, fitted_model: FittedModel) -> KnownConstants:

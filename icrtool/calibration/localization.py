@@ -140,13 +140,13 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
     """
     used, settings, configured = run.document.filter, run.config.filter, configured_noise(run.config)
     estimates: dict[str, Estimate] = {}
-    for names, std, unit, first, key, free in (
+    for names, std, unit, first, key, is_searched in (
         (("x", "y"), used.process_position_mps, "m/s", configured.position_mps, "process_position_mps",
          settings.process_position_mps == "auto"),
         (("yaw",), used.process_heading_degps, "deg/s", configured.heading_degps, "process_heading_degps",
          settings.process_heading_degps is None),
     ):  # fmt: skip
-        origin = f"of preset {used.preset}, not contradicted by the innovations" if free else "configured"
+        origin = f"of preset {used.preset}, not contradicted by the innovations" if is_searched else "configured"
         if std > first:
             origin = f"raised from {first:g} by the filter's innovations"
         source = f"({std:g} {unit})² × {REFERENCE_STEP_S:g} s, filter.{key}: {origin}"

@@ -72,8 +72,8 @@ def _scores(ground: str, recordings: Sequence[Recording], fits: Mapping[str, Poo
 
 def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit]) -> Iterator[tuple[str, Floats]]:
     """Yield the name of each row, and its errors (k, h) [m] in trials of a recording."""
-    turned = fits.get(f"{RECOMMENDED}{GYRO_SUFFIX}")
-    has_gyro = turned is not None and recording.track.gyro is not None
+    gyro_fit = fits.get(f"{RECOMMENDED}{GYRO_SUFFIX}")
+    has_gyro = gyro_fit is not None and recording.track.gyro is not None
     windows = cut_windows(recording)
     for suffix in ("", GYRO_SUFFIX) if has_gyro else ("",):
         five_terms, eight_terms = (fits[f"{name}{suffix}"].fitted for name in (FIVE, RECOMMENDED))
@@ -84,7 +84,7 @@ def _errors(recording: Recording, trials: Trials, fits: Mapping[str, PooledFit])
                 f"{name}{suffix}",
                 _held(recording, trials, fitted_model, own_constants(windows, fitted_model, recording.width_m)),
             )
-    gyro_model = turned.fitted if turned is not None else None
+    gyro_model = gyro_fit.fitted if gyro_fit is not None else None
     drive = adapt(recording, prior_of_model(recording.width_m, fits[RECOMMENDED].fitted, gyro_model, "other grounds"))
     yield "adaptive", drive.errors(trials).position
     if has_gyro:

@@ -321,24 +321,24 @@ def momentary_knows(run: Run) -> str:
     return ", ".join(parts)
 
 
-def turned_path(run: Run, recording: Recording, turned: Floats, rows: slice) -> tuple[Floats, Complexes]:
+def turned_path(run: Run, recording: Recording, heading_rad: Floats, rows: slice) -> tuple[Floats, Complexes]:
     """Return heading [rad] and place, forward + j right [m], of a path by mean track speed and a heading.
 
     Parameters
     ----------
-    turned : (k,) heading at the states of `rows` [rad]
+    heading_rad : (k,) heading at the states of `rows` [rad]
     rows : states of the path; the place at the first one is 0
     """
     lo, hi = rows.start, rows.stop - 1
-    place = np.zeros(hi + 1 - lo, np.complex128)
+    position = np.zeros(hi + 1 - lo, np.complex128)
     for begin in range(lo, hi, ROWS_AT_ONCE):
         chunk = slice(begin, min(begin + ROWS_AT_ONCE, hi))
         filled = slice(chunk.start - lo, chunk.stop - lo)
-        moved = recording.track.held[chunk] * (run.table.v_left_mps[chunk] + run.table.v_right_mps[chunk]) / 2.0
-        place[filled.start + 1 : filled.stop + 1] = moved * np.exp(
-            0.5j * (turned[filled] + turned[filled.start + 1 : filled.stop + 1])
+        displacement = recording.track.held[chunk] * (run.table.v_left_mps[chunk] + run.table.v_right_mps[chunk]) / 2.0
+        position[filled.start + 1 : filled.stop + 1] = displacement * np.exp(
+            0.5j * (heading_rad[filled] + heading_rad[filled.start + 1 : filled.stop + 1])
         )
-    return turned, np.cumsum(place, out=place)
+    return heading_rad, np.cumsum(position, out=position)
 
 
 def _errors_turned(
@@ -358,16 +358,16 @@ def _errors_turned(
     """
     track, (first_rows, scales, biases) = recording.track, lines()
     gyro = track.gyro if track.gyro is not None else np.zeros(len(track.t))
-    turned, lasted = track.cumulate(gyro), track.cumulate(np.ones(len(track.t)))
+    turn_by_gyro, duration_s = track.cumulate(gyro), track.cumulate(np.ones(len(track.t)))
     errors = TrialErrors.none(trials.ends.shape)
-    of_line = np.searchsorted(trials.starts, np.append(first_rows, len(track.t)))
+    line_starts = np.searchsorted(trials.starts, np.append(first_rows, len(track.t)))
     for line, (scale, bias) in enumerate(zip(scales.tolist(), biases.tolist(), strict=True)):
-        line_trials = slice(of_line[line], of_line[line + 1])
+        line_trials = slice(line_starts[line], line_starts[line + 1])
         if line_trials.start == line_trials.stop or (last := int(trials.ends[line_trials].max())) < 0:
             continue
         first = int(trials.starts[line_trials.start])
         rows = slice(first, last + 1)
-        psi, place = turned_path(run, recording, scale * turned[rows] + bias * lasted[rows], rows)
+        psi, place = turned_path(run, recording, scale * turn_by_gyro[rows] + bias * duration_s[rows], rows)
         for h in range(trials.ends.shape[1]):
             tried = line_trials.start + np.flatnonzero(trials.ends[line_trials, h] >= 0)
             s, e = trials.starts[tried], trials.ends[tried, h]

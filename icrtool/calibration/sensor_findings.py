@@ -103,8 +103,8 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.Sensor
     """
     wheels, findings = run.document.wheels, run.document.alignment
     if not {finding_kind.finding or key for key, finding_kind in FINDING_KINDS.items()} <= findings.keys():
-        metres = run.document.drive.distance_m
-        why = f"{metres:.0f} m of driven distance give too few windows"
+        distance_m = run.document.drive.distance_m
+        why = f"{distance_m:.0f} m of driven distance give too few windows"
         raise DataError(run.name, why, "drive longer")
     driven, parameters = _drive(run), {}
     for key, finding_kind in FINDING_KINDS.items():

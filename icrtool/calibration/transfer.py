@@ -211,10 +211,9 @@ def same_route(first: Track, second: Track) -> bool:
     ends = [float(track.distance[-1]) for track in (first, second)]
     if abs(ends[1] - ends[0]) > 0.05 * min(ends):
         return False
-    at = np.arange(0.0, min(ends), 1.0)
-    places = [np.interp(at, track.distance, track.north) + 1j * np.interp(at, track.distance, track.east)
-              for track in (first, second)]  # fmt: skip
-    return bool(np.abs(places[1] - places[0]).max() < SAME_ROUTE_M)
+    distances_m = np.arange(0.0, min(ends), 1.0)
+    positions = [np.interp(distances_m, track.distance, track.place) for track in (first, second)]
+    return bool(np.abs(positions[1] - positions[0]).max() < SAME_ROUTE_M)
 
 
 def _parameter_differences(first: Calibration, second: Calibration) -> tuple[documents.ParameterDifference, ...]:

@@ -42,10 +42,10 @@ EPILOG_GATE = (
 
 def read_horizons(text: str) -> tuple[float, ...]:
     """Return the distances [m] in the value of ``--horizons``; refuse a distance that is not above zero."""
-    metres = options.numbers_reader("M,M,...")(text)
-    if min(metres) <= 0:
+    horizons_m = options.numbers_reader("M,M,...")(text)
+    if min(horizons_m) <= 0:
         raise click.BadParameter(f"{text!r} has a distance that is not above zero")
-    return metres
+    return horizons_m
 
 
 REPORT_OPTIONS = options.report_options(
@@ -56,7 +56,7 @@ REPORT_OPTIONS = options.report_options(
            "/odometry/filtered; the LOG is read again; repeatable.", multiple=True),
     option("--outage outage_s", "SECONDS", POSITIVE, "Force GNSS outages of this length, and report the error at their "
            "end; repeatable.", multiple=True),
-    option("--outage-at outage_at_s", "SECONDS", float, "Begin of a forced outage, in seconds since the first "
+    option("--outage-at outage_at_s", "SECONDS", float, "Start of a forced outage, in seconds since the first "
            "state; default: evenly spaced; repeatable.", multiple=True),
     choice("--reference", get_args(Reference), "Compare trials with the states of the filter, or of the smoother "
            "(fit --smooth).", default="filter"),
@@ -192,7 +192,7 @@ def report_one(
             # report.
             run, folder = stack.enter_context(fitted_log(source, place, config, request.fit, files, printer))
         if request.outage_at_s and not dropout_report.forced_lengths_s(run, request):
-            raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
+            raise click.UsageError("--outage-at gives the start of an outage, and needs --outage for its length")
         baseline = None
         if other_results.baseline is not None:
             robot = run.document.config.robot.name or ""

@@ -185,12 +185,12 @@ def _expanded(place: Path) -> list[Path]:
 
 def named_place(source: str) -> tuple[LogText, Path]:
     """Return the name of the group and the place in an argument ``NAME=PLACE`` or ``PLACE``."""
-    whole = place_of(source)
+    whole_place = place_of(source)
     name, sign, place = source.partition("=")
     # An address may have an equals sign in its query.
-    if sign and name and place and not isinstance(place_of(name), UrlPath) and not whole.exists():
+    if sign and name and place and not isinstance(place_of(name), UrlPath) and not whole_place.exists():
         return LogText(name), place_of(place)
-    return LogText(whole.name or str(whole)), whole
+    return LogText(whole_place.name or str(whole_place)), whole_place
 
 
 def grounds_of(sources: tuple[str, ...]) -> tuple[list[Path], list[str]]:
@@ -208,15 +208,15 @@ def grounds_of(sources: tuple[str, ...]) -> tuple[list[Path], list[str]]:
     places = [named_place(source) for source in sources]
     have_ground = [place_of(source) != path for source, (_, path) in zip(sources, places, strict=True)]
     if len(places) == 1 and not have_ground[0] and fleet_files.is_fleet(places[0][1]):
-        of_grounds = [(name, run) for name, runs in fleet_files.runs_of_fleet(places[0][1]).items() for run in runs]
-        return [run for _, run in of_grounds], [str(name) for name, _ in of_grounds]
+        ground_runs = [(name, run) for name, runs in fleet_files.runs_of_fleet(places[0][1]).items() for run in runs]
+        return [run for _, run in ground_runs], [str(name) for name, _ in ground_runs]
     if any(have_ground) and not all(have_ground):
-        without = escaped(str(places[have_ground.index(False)][1]))
-        raise errors.ConfigError(without, "names no ground", "write GROUND= before each argument, or before none")
-    of_grounds = [
+        groundless = escaped(str(places[have_ground.index(False)][1]))
+        raise errors.ConfigError(groundless, "names no ground", "write GROUND= before each argument, or before none")
+    ground_runs = [
         (str(name), run_or_log)
         for name, place in places
         for path in _expanded(place)
         for run_or_log in runs_or_logs(path)
     ]
-    return [run_or_log for _, run_or_log in of_grounds], [name for name, _ in of_grounds] if all(have_ground) else []
+    return [run_or_log for _, run_or_log in ground_runs], [name for name, _ in ground_runs] if all(have_ground) else []

@@ -419,7 +419,7 @@ def _split_gates(_context: click.Context, _option: click.Parameter, gates: tuple
         except errors.IcrToolError as err:
             raise click.BadParameter(str(err)) from err
         if rows.kind_of(model) not in rows.REPORT_ROWS:
-            names = [f"{row}{turned}" for row in rows.REPORT_ROWS for turned in ("", "_gyro")]
+            names = [f"{row}{suffix}" for row in rows.REPORT_ROWS for suffix in ("", "_gyro")]
             meant = did_you_mean(model, names)
             raise click.BadParameter(f"gate {line!r}: no model {model}; {meant}one of {', '.join(rows.REPORT_ROWS)}")
     return lines

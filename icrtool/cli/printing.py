@@ -287,7 +287,7 @@ class Stages(LiveLine):
         self.rewrite(f"{self._title} (compiling, once on this computer: about 8 s) …")
 
     def begin(self, stage: str) -> None:
-        """Show the begin of a stage with this name, for example ``reading``."""
+        """Show the start of a stage with this name, for example ``reading``."""
         self._title = f"{self.name}: {stage}" if stage else self.name
         self._shown_s = time.monotonic()
         self.rewrite(f"{self._title} …")

@@ -76,10 +76,10 @@ def gnss_text(text: str) -> float:
     """Return the standard deviation of positions [m] in a text: ``rtk``, ``waas`` or a number of metres."""
     if text in GNSS_NOISE_M:
         return GNSS_NOISE_M[text]
-    metres = numbers_reader("rtk, waas or METRES", 1)(text)[0]
-    if metres < 0:
+    noise_m = numbers_reader("rtk, waas or METRES", 1)(text)[0]
+    if noise_m < 0:
         raise click.BadParameter(f"{text!r} is a negative noise")
-    return metres
+    return noise_m
 
 
 def check_changes(changes: Iterable[tuple[float, object]], duration_s: float) -> None:
@@ -219,8 +219,10 @@ def simulate_command(
     check_changes(drive.changes, drive.duration_s)
     counts = encoder_counts or config.robot.encoder_counts_per_rev or PAPER_COUNTS
     radius_m = needed_number(config, "wheel_radius_m")
-    metres = 2 * math.pi * radius_m / counts
-    sensors_given = drives.Sensors(metres_per_count=metres, antenna_forward_m=antenna[0], antenna_right_m=antenna[1])
+    metres_per_count = 2 * math.pi * radius_m / counts
+    sensors_given = drives.Sensors(
+        metres_per_count=metres_per_count, antenna_forward_m=antenna[0], antenna_right_m=antenna[1]
+    )
     sensed = sensors(sensors_given)
     rate = wheel_rate or (COMMAND_RATE_HZ if sensed.wheels == "commanded" else ENCODER_RATE_HZ)
     sensed = replace(sensed, wheel_rate_hz=rate)

@@ -278,10 +278,10 @@ class _Runs(NamedTuple):
 
 
 def _outage_plans(run: Run, request: ReportRequest) -> list[tuple[tuple[int, int], ...]]:
-    """Return the begins and ends [ns] of the forced outages of each length."""
+    """Return the starts and ends [ns] of the forced outages of each length."""
     lengths_s = forced_lengths_s(run, request)
     if request.outage_at_s and not lengths_s:
-        raise ConfigError("outage_at_s", "gives begins of outages without a length", "give outage_s too")
+        raise ConfigError("outage_at_s", "gives starts of outages without a length", "give outage_s too")
     return [shown_paths.plan_outages(run, length, request.outage_at_s) for length in lengths_s]
 
 

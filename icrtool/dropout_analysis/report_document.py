@@ -187,11 +187,11 @@ def _ladder(errors: report.OpenLoopErrors, parts: ReportParts) -> documents.Ladd
     compared_models = parts.compared_models
     if compared_models is None:
         return documents.LadderDocument(left_out=parts.left_out)
-    of_calibrations, turned = {used.name for used in parts.calibrations}, f"_{compared_models.heading}"
+    calibration_names, heading_suffix = {used.name for used in parts.calibrations}, f"_{compared_models.heading}"
     models = []
     for result in errors.results:
-        if result.name not in of_calibrations and kind_of(result.name) != TOPIC_ROW:
-            with_heading = bool(compared_models.heading) and result.name.endswith(turned)
+        if result.name not in calibration_names and kind_of(result.name) != TOPIC_ROW:
+            with_heading = bool(compared_models.heading) and result.name.endswith(heading_suffix)
             rows = [astuple(row)[1:ERROR_FIELDS] for row in result.document.by_horizon]
             heading = compared_models.heading if with_heading else "wheels"
             models.append(
@@ -228,10 +228,10 @@ def with_other_grounds(
     first = next(iter(scores.values()), ())
     distances = []
     for reach in budgets:
-        by, row_kind = turned_by(reach.model), kind_of(reach.model)
-        row = f"{RECOMMENDED if row_kind == 'calibration' else row_kind}{f'_{by}' if by else ''}"
-        of_row = {"calibration": scores.get(reach.model, ()), "adaptive": first}.get(row_kind, ())
-        ends = other_ground_ends(of_row, row, reach.budget_m)
+        turn_sensor, row_kind = turned_by(reach.model), kind_of(reach.model)
+        row = f"{RECOMMENDED if row_kind == 'calibration' else row_kind}{f'_{turn_sensor}' if turn_sensor else ''}"
+        row_scores = {"calibration": scores.get(reach.model, ()), "adaptive": first}.get(row_kind, ())
+        ends = other_ground_ends(row_scores, row, reach.budget_m)
         if ends is None:
             distances.append(reach)
         else:

@@ -167,9 +167,9 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     chord[chord > LONGEST_CHORD * horizon_m] = 0.0
     straight = moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)]
     del chord  # A column of a long log is large.
-    off = np.abs(np.abs(change(track.heading)) - np.pi)
+    off_half_turn_rad = np.abs(np.abs(change(track.heading)) - np.pi)
     examples = []
-    for group in (moving[off <= off.min() + ALIKE_RAD], straight):
+    for group in (moving[off_half_turn_rad <= off_half_turn_rad.min() + ALIKE_RAD], straight):
         sample = group[:: -(-len(group) // TYPICAL_OF)]
         errors = [
             open_loop_errors(track, models[0].icrs, ends[start : start + 1, None], start)[0, 0] for start in sample
@@ -180,8 +180,8 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
 
 
 def _example(
-    run: Run, track: Track, models: tuple[Model, ...], rows: Sequence[ComparedRow], by: str, start: int, end: int,
-    horizon_m: float,
+    run: Run, track: Track, models: tuple[Model, ...], rows: Sequence[ComparedRow], drawn_model: str, start: int,
+    end: int, horizon_m: float,
 ) -> ExampleTrial:  # fmt: skip
     paths: dict[str, OpenLoopPath] = {}
     for model in models:
@@ -197,11 +197,11 @@ def _example(
     }
     table = run.table
     columns = (table.t_s, table.heading_rad, table.distance_m)
-    duration, turned, driven = (float(column[end] - column[start]) for column in columns)
+    duration, turn_rad, driven = (float(column[end] - column[start]) for column in columns)
     document = TrialDocument(
-        model=by, stamp_ns=int(table.stamp_ns[start]), t_s=float(table.t_s[start]),
+        model=drawn_model, stamp_ns=int(table.stamp_ns[start]), t_s=float(table.t_s[start]),
         north_m=float(table.north_m[start]), east_m=float(table.east_m[start]), horizon_m=horizon_m,
-        heading_change_deg=float(np.degrees(turned)), speed_mean_mps=driven / duration if duration > 0 else 0.0,
+        heading_change_deg=float(np.degrees(turn_rad)), speed_mean_mps=driven / duration if duration > 0 else 0.0,
         errors_m=errors,
     )  # fmt: skip
     shown = slice(start, end + 1)
@@ -291,7 +291,7 @@ def _meets(begin_s: Floats, length_s: float, spans_s: Floats) -> Bools:
 
 
 def _spaced(run: Run, length_s: float) -> list[float]:
-    """Return the begins [s] of outages that are evenly spaced in half of the moving time after convergence.
+    """Return the starts [s] of outages that are evenly spaced in half of the moving time after convergence.
 
     No outage begins where it would overlap an outage of the log, a gap in the wheel data or a jump of the reference.
     """
@@ -307,10 +307,10 @@ def _spaced(run: Run, length_s: float) -> list[float]:
     if count < 1:
         text = f"{length_s:g} s is too long for a drive of {last:.1f} s, {moved[-1]:.1f} s of it moving"
         raise ConfigError("outage", text, "choose a shorter one")
-    free = (rest - count * length_s) / (count + 1)
-    begins = before + free + np.arange(count) * (length_s + free)
+    free_s = (rest - count * length_s) / (count + 1)
+    begins = before + free_s + np.arange(count) * (length_s + free_s)
     # If an outage would begin while the robot stands, it begins when the robot moves again.
-    return [float(t[place - 1]) for place in np.searchsorted(moved, begins, side="right")]
+    return [float(t[row - 1]) for row in np.searchsorted(moved, begins, side="right")]
 
 
 def real_outages(run: Run) -> tuple[Outage, ...]:
@@ -318,7 +318,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
 
     The end error is the distance to the fixes after the outage. The filter has the same error as the open-loop path,
     because it used only the wheels in the outage. Three kinds of outages are left out: outages without an end and
-    outages with a gap in the wheel data, because they have no end error, and an outage at the begin of the drive,
+    outages with a gap in the wheel data, because they have no end error, and an outage at the start of the drive,
     because neither position nor ICRs were known before it.
     """
     track, table, fixes = track_of(run), run.table, run.sensors.fixes
@@ -336,9 +336,9 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         # The error of each used fix after the outage is its distance from the antenna on the path.
         rows = np.flatnonzero(run.gnss.used & (fixes.stamp_ns >= end) & (fixes.stamp_ns <= max(end, stamps[-1])))
         cos, sin = np.cos(path.heading), np.sin(path.heading)
-        at, state_s = (fixes.stamp_ns[rows] - stamps[0]) / 1e9, (stamps - stamps[0]) / 1e9
-        north = np.interp(at, state_s, path.north + forward * cos - right * sin) - fixes.north_m[rows]
-        east = np.interp(at, state_s, path.east + forward * sin + right * cos) - fixes.east_m[rows]
+        fix_s, state_s = (fixes.stamp_ns[rows] - stamps[0]) / 1e9, (stamps - stamps[0]) / 1e9
+        north = np.interp(fix_s, state_s, path.north + forward * cos - right * sin) - fixes.north_m[rows]
+        east = np.interp(fix_s, state_s, path.east + forward * sin + right * cos) - fixes.east_m[rows]
         error = finite_or_none(float(np.hypot(north.mean(), east.mean())))
         inside = slice(last - first + 1)
         driven_m = float(table.distance_m[last] - table.distance_m[first])

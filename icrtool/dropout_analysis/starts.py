@@ -148,23 +148,23 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
     stds = at_ends(table.std_north_m), at_ends(table.std_east_m), at_ends(table.std_heading_rad)
     generators = (rng for group in trials for rng in repeat(np.random.default_rng(seed), len(group)))
     rows = []
-    for trial, rng, of_north, of_east, (of_heading, _) in zip(every, generators, *stds, strict=True):
+    for trial, rng, north_stds, east_stds, (start_std, _) in zip(every, generators, *stds, strict=True):
         start, end = trial.start, trial.end
         if not len(start):
             rows.append(ReferenceRow(trial.horizon_m, None, None, None))
             continue
         north, east = table.north_m[end] - table.north_m[start], table.east_m[end] - table.east_m[start]
-        north_std, east_std = ([np.sqrt(position) * std for std in of_both] for of_both in (of_north, of_east))
-        std_heading = np.sqrt(heading) * of_heading
+        north_std, east_std = ([np.sqrt(position) * std for std in end_stds] for end_stds in (north_stds, east_stds))
+        std_heading = np.sqrt(heading) * start_std
         drawn = rng.standard_normal((5, DRAWS))
-        turned = std_heading * drawn[0]
-        off_north = north_std[0] * drawn[1] - north_std[1] * drawn[2] - turned * east
-        off_east = east_std[0] * drawn[3] - east_std[1] * drawn[4] + turned * north
-        error = np.hypot(off_north, off_east)
+        heading_error = std_heading * drawn[0]
+        error_north = north_std[0] * drawn[1] - north_std[1] * drawn[2] - heading_error * east
+        error_east = east_std[0] * drawn[3] - east_std[1] * drawn[4] + heading_error * north
+        error = np.hypot(error_north, error_east)
         square = sum(std**2 for std in (*north_std, *east_std))
         square = square + std_heading**2 * (north**2 + east**2)
-        of_error = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
-        rows.append(ReferenceRow(trial.horizon_m, *(finite_or_none(float(number)) for number in of_error)))
+        numbers = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
+        rows.append(ReferenceRow(trial.horizon_m, *(finite_or_none(float(number)) for number in numbers)))
     return tuple(rows)
 
 

@@ -132,12 +132,12 @@ def _errors(poses: TopicPoses, t: Floats, track: Track, trials: Trials) -> Trial
 
 def _path(poses: TopicPoses, t: Floats, track: Track, start: int, end: int) -> OpenLoopPath | None:
     """Return the path of a topic between two states, aligned with the reference at the first; None across a gap."""
-    at = track.t[start : end + 1]
-    if not poses.covered(t, at[:1], at[-1:]).all():
+    times_s = track.t[start : end + 1]
+    if not poses.covered(t, times_s[:1], times_s[-1:]).all():
         return None
-    place, heading = poses.at(t, at)
+    position, heading = poses.at(t, times_s)
     turn = track.heading[start] - heading[0]
-    moved = np.exp(1j * turn) * (place - place[0])
+    moved = np.exp(1j * turn) * (position - position[0])
     return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, heading + turn)
 
 
@@ -161,21 +161,21 @@ def _compared_rows(track: Track, covered: np.ndarray) -> Ints:
     return np.asarray(rows[covered[rows] & ~track.in_outage[rows]])
 
 
-def _departure(place: Complexes, reference: Complexes, distance: Floats) -> Departure | None:
+def _departure(positions: Complexes, reference: Complexes, distance: Floats) -> Departure | None:
     """Return the departure of places (n,) from a reference (n,), at distances (n,) [m]; None for too few places."""
-    if len(place) < FEWEST_COMPARED:
+    if len(positions) < FEWEST_COMPARED:
         return None
     parts = np.searchsorted(distance, distance[0] + (distance[-1] - distance[0]) * np.arange(1, PIECES) / PIECES)
-    whole = _misfit(place, reference)
+    drive_misfit = _misfit(positions, reference)
     pieces = [
         _misfit(part, other)
-        for part, other in zip(np.split(place, parts), np.split(reference, parts), strict=True)
+        for part, other in zip(np.split(positions, parts), np.split(reference, parts), strict=True)
         if len(part) >= FEWEST_COMPARED // PIECES
     ]
     if len(pieces) < PIECES or not min(pieces) > 0.0:
         return None
     logs = np.log(pieces)
-    return Departure(whole, float(np.exp(logs.mean())), float(logs.std(ddof=1)) / math.sqrt(PIECES))
+    return Departure(drive_misfit, float(np.exp(logs.mean())), float(logs.std(ddof=1)) / math.sqrt(PIECES))
 
 
 def _misfit(place: Complexes, reference: Complexes) -> float:

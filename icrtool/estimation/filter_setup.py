@@ -60,7 +60,7 @@ LEAST_ICR_IN_HALF_WIDTHS = 0.2
 2014, Section 2), but an antenna off the centre line shifts them."""
 
 EVENT_MARGIN_S = 0.2
-"""Time by which slip events are extended on both sides [s], because their begins and ends are uncertain by this
+"""Time by which slip events are extended on both sides [s], because their starts and ends are uncertain by this
 time."""
 
 RECOVERY_COUNT, RECOVERY_S = 10, 1.0

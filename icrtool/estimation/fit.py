@@ -97,7 +97,7 @@ def followed_jumps(
     """
     used = gnss.stamp_ns[gnss.used], heading.stamp_ns[heading.used]
     noise = np.sqrt(sensors.fixes.var_north_m2 + sensors.fixes.var_east_m2)
-    near = gnss.stamp_ns[gnss.used & (gnss.difference < FOLLOWED_SIGMAS * noise)]
+    near_ns = gnss.stamp_ns[gnss.used & (gnss.difference < FOLLOWED_SIGMAS * noise)]
 
     def followed(jump: ReferenceJump) -> ReferenceJump:
         """Return a jump from the last used measurement before it to the first used measurement after it."""
@@ -108,7 +108,7 @@ def followed_jumps(
 
     def settled(jump: ReferenceJump) -> ReferenceJump:
         """Return a jump that ends when the filter is near the fixes again."""
-        end = jump.end_ns if jump.kind == "heading" else _first_from(near, jump.end_ns)
+        end = jump.end_ns if jump.kind == "heading" else _first_from(near_ns, jump.end_ns)
         return msgspec.structs.replace(jump, end_ns=min(end, jump.end_ns + round(FOLLOWS_WITHIN_S * 1e9)))
 
     # The filter does not follow the reference between the jumps of one rejection, so these jumps are joined.
@@ -120,21 +120,21 @@ def followed_jumps(
     ]
     # A decided jump includes the undecided jumps near it.
     decided = _joined([jump for jump in spans if not jump.undecided], SAME_JUMP_NS)
-    begins, free = [jump.begin_ns for jump in decided], []
+    begins, separate = [jump.begin_ns for jump in decided], []
     for jump in spans:
         row = bisect_right(begins, jump.begin_ns)
         before, after = decided[max(row - 1, 0) : row], decided[row : row + 1]
         joins = any(jump.begin_ns <= other.end_ns + SAME_JUMP_NS for other in before)
         joined = any(other.begin_ns <= jump.end_ns + SAME_JUMP_NS for other in after)
         if jump.undecided and not joins and not joined:
-            free.append(jump)
-    return tuple(sorted((*decided, *_joined(free, SAME_JUMP_NS)), key=attrgetter("begin_ns")))
+            separate.append(jump)
+    return tuple(sorted((*decided, *_joined(separate, SAME_JUMP_NS)), key=attrgetter("begin_ns")))
 
 
-def _first_from(stamps: Ints, at: int) -> int:
+def _first_from(stamps: Ints, time_ns: int) -> int:
     """Return the first stamp at or after a time [ns]; the time itself if there is no such stamp."""
-    row = int(np.searchsorted(stamps, at))
-    return int(stamps[row]) if row < len(stamps) else at
+    row = int(np.searchsorted(stamps, time_ns))
+    return int(stamps[row]) if row < len(stamps) else time_ns
 
 
 def _joined(jumps: list[ReferenceJump], near_ns: int) -> list[ReferenceJump]:

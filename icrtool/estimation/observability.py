@@ -137,11 +137,12 @@ def cut_states(
 
 
 def prior_std(width_m: float, heading_std_rad: float = 0.0) -> Floats:
-    """Return the standard deviations (6,) of the parameters in `StateWindows.jacobian` before a drive.
+    """Return the deviations (6,) of the parameters in `StateWindows.jacobian` before a drive [m, m, m, rad, 1, 1].
 
     Parameters
     ----------
-    width_m : of the y ICRs; heading_std_rad : of the error that all headings share, where it is known
+    width_m : standard deviation of each ICR [m]
+    heading_std_rad : standard deviation of the error that all headings share [rad]; 0 where it is not known
     """
     return np.array([width_m, width_m, width_m, max(HEADING_BIAS_RAD, heading_std_rad), SCALE_ERROR, SCALE_ERROR])
 

@@ -84,7 +84,7 @@ def drive_wheels(table: States, in_gap: Bools, icrs: FrozenIcrs, every: int = 1)
     Notes
     -----
     The motion of the wheels in a gap is not known. It is replaced by the filter's displacement, turned by the heading
-    error of the odometry at the begin of the gap, so that a gap does not change the error.
+    error of the odometry at the start of the gap, so that a gap does not change the error.
     """
     kept = np.append(np.arange(0, len(table) - 1, every), len(table) - 1)
     path, total_m, largest_m = OpenLoopPath(*np.empty((3, len(kept)))), 0.0, 0.0
@@ -102,30 +102,30 @@ def _pieces(table: States, in_gap: Bools, icrs: FrozenIcrs) -> Iterator[tuple[sl
     """Yield the path of `drive_wheels` in order, some states at a time, because a whole path is large."""
     track = track_of_states(table, in_gap, np.empty((0, 2), np.int64))
     edges = np.flatnonzero(in_gap[:-1])
-    miss_north, miss_east, turned = 0.0, 0.0, 0.0
+    north_error, east_error, heading_error = 0.0, 0.0, 0.0
     for first, last in zip([0, *(edges + 1).tolist()], [*edges.tolist(), len(table) - 1], strict=True):
         north, east, psi = float(track.north[first]), float(track.east[first]), float(track.heading[first])
-        cos, sin = math.cos(turned), math.sin(turned)
+        cos, sin = math.cos(heading_error), math.sin(heading_error)
         if first:
-            # The displacement is rotated by the heading error at the begin of the gap. This is the resulting
+            # The displacement is rotated by the heading error at the start of the gap. This is the resulting
             # difference.
             step_north, step_east = north - float(track.north[first - 1]), east - float(track.east[first - 1])
-            miss_north += step_north * cos - step_east * sin - step_north
-            miss_east += step_north * sin + step_east * cos - step_east
+            north_error += step_north * cos - step_east * sin - step_north
+            east_error += step_north * sin + step_east * cos - step_east
         path = OpenLoopPath(*(np.array([value]) for value in (north, east, psi)))
         for rows, piece in chain([(slice(first, first + 1), path)], open_loop_pieces(track, icrs, first, last)):
             ahead_north, ahead_east = piece.north - north, piece.east - east
             path = OpenLoopPath(
-                north + miss_north + ahead_north * cos - ahead_east * sin,
-                east + miss_east + ahead_north * sin + ahead_east * cos,
-                piece.heading + turned,
+                north + north_error + ahead_north * cos - ahead_east * sin,
+                east + east_error + ahead_north * sin + ahead_east * cos,
+                piece.heading + heading_error,
             )
             yield rows, path
-        miss_north, miss_east = (
+        north_error, east_error = (
             float(column[-1] - reference[last])
             for column, reference in ((path.north, track.north), (path.east, track.east))
         )
-        turned = float(path.heading[-1] - track.heading[last])
+        heading_error = float(path.heading[-1] - track.heading[last])
 
 
 def _without_jumps(table: States, jumps: Iterable[ReferenceJump]) -> tuple[Floats, Floats]:
@@ -156,7 +156,7 @@ class GapPaths(NamedTuple):
 
     Attributes
     ----------
-    row : (g,) rows of the states at their begins
+    row : (g,) rows of the states at their starts
     beyond_m : (g,) length of the path through the fixes in each gap, minus the chord from state to state [m]
     unseen_s, unseen_m : duration of the gaps without a fix in which the robot moved, and the straight distance there
     """
@@ -285,13 +285,13 @@ def _covers(measured_ns: Ints, states_ns: Ints) -> bool:
     return bool(np.max(np.diff(np.concatenate([states_ns[:1], within, states_ns[-1:]]))) < hole)
 
 
-def _integrate(t: Floats, rate: Floats, at: Floats) -> Floats:
-    """Return the turn [rad] until each of the times `at`: by trapezoids; beyond the samples the rate is constant."""
-    whole, turned = np.empty(len(at)), trapezoids(t, rate)
-    for lo in range(0, len(at), ROWS_AT_ONCE):
-        chunk = at[lo : lo + ROWS_AT_ONCE]
-        within = np.interp(chunk, t, turned)
+def _integrate(t: Floats, rate: Floats, times_s: Floats) -> Floats:
+    """Return the turn [rad] until each of `times_s`: by trapezoids; beyond the samples the rate is constant."""
+    angle, sample_angle = np.empty(len(times_s)), trapezoids(t, rate)
+    for lo in range(0, len(times_s), ROWS_AT_ONCE):
+        chunk = times_s[lo : lo + ROWS_AT_ONCE]
+        within = np.interp(chunk, t, sample_angle)
         within += np.minimum(chunk - t[0], 0.0) * rate[0]
         within += np.maximum(chunk - t[-1], 0.0) * rate[-1]
-        whole[lo : lo + len(chunk)] = within
-    return whole
+        angle[lo : lo + len(chunk)] = within
+    return angle

@@ -351,7 +351,7 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
     headings, psi, rows = sensors.headings, table.heading_rad, np.flatnonzero(used)
     stamps = headings.stamp_ns[rows]
     seen_s = (stamps - table.stamp_ns[0]) / 1e9
-    off = wrapped(headings.heading_rad[rows] - np.interp(seen_s, table.t_s, psi))
+    difference_rad = wrapped(headings.heading_rad[rows] - np.interp(seen_s, table.t_s, psi))
     for lo in range(0, len(psi), ROWS_AT_ONCE):
         chunk = slice(lo, lo + ROWS_AT_ONCE)
         last = np.searchsorted(stamps, table.stamp_ns[chunk], side="right") - 1
@@ -359,7 +359,7 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
         recent = (last >= 0) & (age < LONGEST_CARRY_S)
         std = np.sqrt(headings.var_rad2[rows[last]] + TURN_WANDER_RAD**2 * np.abs(age))
         clear = recent & (LEAST_STD_RATIO * std < table.std_heading_rad[chunk])
-        np.add(psi[chunk], off[last], out=psi[chunk], where=clear)
+        np.add(psi[chunk], difference_rad[last], out=psi[chunk], where=clear)
         np.copyto(table.std_heading_rad[chunk], std, where=clear)
 
 

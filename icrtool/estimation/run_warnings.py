@@ -130,9 +130,9 @@ def _cause_of_all(filtered: str, wheels: WheelFacts | None) -> Note | None:
         return note("wheels_filtered", f"filtered or fused odometry ({filtered}); {needed}")
     if wheels is None or wheels.exchanged_s is None:
         return None
-    at = f"{wheels.exchanged_s:.0f}"
-    parts = f"fit each part by itself: --to {at}, --from {at}"
-    return note("sides_exchanged", f"left and right wheels are exchanged before or after about {at} s; {parts}")
+    time_text = f"{wheels.exchanged_s:.0f}"
+    advice = f"fit each part by itself: --to {time_text}, --from {time_text}"
+    return note("sides_exchanged", f"left and right wheels are exchanged before or after about {time_text} s; {advice}")
 
 
 def _why_turns_unexplained(wheels: WheelFacts | None) -> str:

@@ -287,7 +287,7 @@ def _speed_while_turning(table: States) -> float:
 
 
 def _span_with_seconds(span: SlipEvent | ReferenceJump, table: States) -> dict[str, Any]:
-    """Return the fields of a span, and its begin and end in seconds since the first recorded state."""
+    """Return the fields of a span, and its start and end in seconds since the first recorded state."""
     start_ns = int(table.stamp_ns[0])
     seconds = {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
     return asdict(span) | seconds

@@ -26,7 +26,7 @@ LARGEST_ADVANCE_M = 5.0
 counts as a gap."""
 
 ON_EDGE = 1e-6
-"""Share of a step by which a stamp may precede the begin of the step. Decimal fractions of a second are not exact."""
+"""Share of a step by which a stamp may precede the start of the step. Decimal fractions of a second are not exact."""
 
 
 class SampleRow(IntEnum):

@@ -263,7 +263,7 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
     Returns
     -------
     parameters : (6,) of the terms, for wheels of the configured radius
-    by : (6, 5) derivatives by the three ICRs [1/m], by a scale of both wheel speeds, and by the difference of the left
+    derivatives : (6, 5) by the three ICRs [1/m], by a scale of both wheel speeds, and by the difference of the left
         and the right scale
 
     Notes
@@ -274,7 +274,7 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
     right, left, x = icrs_m.tolist()
     W = right - left
     middle, gain, aside = (right + left) / W, width_m / W, -2.0 * x / W
-    by = {
+    derivatives = {
         "vx_v": (0.0, 0.0, 0.0, 1.0, middle / 2),
         "vx_w": (-2.0 * left / W**2, 2.0 * right / W**2, 0.0, middle, 0.5),
         "omega_w": (-gain / W, gain / W, 0.0, gain, 0.0),
@@ -284,7 +284,7 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
     }
     value = {"vx_v": 1.0, "vx_w": middle, "omega_w": gain, "omega_v": 0.0, "vy_w": aside, "vy_v": 0.0}
     terms = FULL_LINEAR.terms
-    return np.array([value[term] for term in terms]), np.array([by[term] for term in terms])
+    return np.array([value[term] for term in terms]), np.array([derivatives[term] for term in terms])
 
 
 NOT_SHOWN = 0.7
@@ -324,8 +324,10 @@ class FittedModel:
     def not_shown(self) -> tuple[str, ...]:
         """Names of the terms that the data did not show; their parameters come from the prior."""
         hardly_narrowed = self.std / self.model.prior_std > NOT_SHOWN
-        near = np.abs(self.parameters - self.model.prior_mean) < 2.0 * self.std
-        return tuple(name for name, unseen in zip(self.model.terms, hardly_narrowed & near, strict=True) if unseen)
+        is_near_prior = np.abs(self.parameters - self.model.prior_mean) < 2.0 * self.std
+        return tuple(
+            name for name, unseen in zip(self.model.terms, hardly_narrowed & is_near_prior, strict=True) if unseen
+        )
 
     def complete(self, motion: WheelMotion) -> WheelMotion:
         """Return a motion with the turn rate of the wheels-only model, where the model has one."""
@@ -340,13 +342,13 @@ class FittedModel:
 
     def geometry(self, width_m: float) -> tuple[TrackGeometry, Floats]:
         """Return ICRs, multiplier and radius factors, and their covariance (6, 6)."""
-        at = track_geometry(self.model, self.parameters, width_m)
+        geometry = track_geometry(self.model, self.parameters, width_m)
         # The derivatives come from complex steps (Squire and Trapp 1998).
         moved = self.parameters + TINY * 1j * np.eye(len(self.parameters))
         columns = [np.imag(track_geometry(self.model, parameters, width_m)) / TINY for parameters in moved]
-        by_parameter = np.reshape(columns, (len(moved), len(at)))
+        by_parameter = np.reshape(columns, (len(moved), len(geometry)))
         covariance: Floats = by_parameter.T @ self.covariance @ by_parameter
-        return at, covariance
+        return geometry, covariance
 
 
 class Lever(NamedTuple):

@@ -310,17 +310,21 @@ def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> 
     used = np.zeros(int(e.max()) + 1, np.bool_)
     used[s] = used[e] = used[a] = True
     rows, number = first + np.flatnonzero(used), np.cumsum(used) - 1
-    turned, place = path(recording.track.t[rows])
-    s, e, a, off = number[s], number[e], number[a], turned - track.heading[rows]
-    turn, reference = np.exp(-1j * off), track.north[rows] + 1j * track.east[rows]
-    made, driven = turn[s] * (place[e] - place[s]), reference[e] - reference[s]
+    path_heading, position = path(recording.track.t[rows])
+    s, e, a, heading_error = number[s], number[e], number[a], path_heading - track.heading[rows]
+    turn, reference = np.exp(-1j * heading_error), track.north[rows] + 1j * track.east[rows]
+    moved_by_model, moved_by_reference = turn[s] * (position[e] - position[s]), reference[e] - reference[s]
     # A robot that turns back within the first metres shows no direction.
-    began, of_reference = turn[s] * (place[a] - place[s]), reference[a] - reference[s]
-    shown = np.minimum(np.abs(began), np.abs(of_reference)) > ALIGNED_OVER_M / 2.0
-    made_aligned = made * np.where(shown, np.exp(1j * np.angle(of_reference * np.conj(began))), 1.0)
+    first_by_model, first_by_reference = turn[s] * (position[a] - position[s]), reference[a] - reference[s]
+    shown = np.minimum(np.abs(first_by_model), np.abs(first_by_reference)) > ALIGNED_OVER_M / 2.0
+    moved_aligned = moved_by_model * np.where(
+        shown, np.exp(1j * np.angle(first_by_reference * np.conj(first_by_model))), 1.0
+    )
     long_enough = track.distance[end] - track.distance[start] >= 2.0 * ALIGNED_OVER_M
-    aligned = np.where(long_enough, np.abs(made_aligned - driven), np.nan)
-    return TrialErrors(np.abs(made - driven), np.abs(off[e] - off[s]), aligned)
+    aligned = np.where(long_enough, np.abs(moved_aligned - moved_by_reference), np.nan)
+    return TrialErrors(
+        np.abs(moved_by_model - moved_by_reference), np.abs(heading_error[e] - heading_error[s]), aligned
+    )
 
 
 def predicted_path(
@@ -397,12 +401,13 @@ def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: 
     every = rows_at_steps(at - at[0], TURN_S)
     if len(every) < FEWEST_TURNS:
         return GyroLine(float("nan"), float("nan"), 0.0)
-    made, lasting = np.diff(heading[every]), np.diff(at[every])
+    reference_turns, durations_s = np.diff(heading[every]), np.diff(at[every])
 
     def evaluate(x: Floats) -> tuple[Floats, Floats]:
         read = at[every] + x[2]
         by_scale, by_lead = (np.diff(np.interp(read, t, column)) for column in (turned, rate))
-        return x[0] * by_scale + x[1] * lasting - made, np.column_stack([by_scale, lasting, x[0] * by_lead])
+        residuals = x[0] * by_scale + x[1] * durations_s - reference_turns
+        return residuals, np.column_stack([by_scale, durations_s, x[0] * by_lead])
 
     zero = np.zeros(3)
     return GyroLine(*robust_least_squares(evaluate, zero, zero, GYRO_PRIOR_STD, overlap=10.0).x.tolist())
@@ -454,8 +459,8 @@ class PastLines(NamedTuple):
 
 def past_gyro_lines(track: Track) -> PastLines:
     """Return the lines of a track's gyro that are known from the past of each state."""
-    turned = np.zeros(len(track.t)) if track.gyro is None else track.cumulate(track.gyro)
-    return past_lines(track, lambda rows: turned[rows], GYRO_START_STD)
+    gyro_turn = np.zeros(len(track.t)) if track.gyro is None else track.cumulate(track.gyro)
+    return past_lines(track, lambda rows: gyro_turn[rows], GYRO_START_STD)
 
 
 def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tuple[float, float]) -> PastLines:
@@ -478,7 +483,7 @@ def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tu
     while begins[-1] < t[-1]:
         begins.append(begins[-1] + min(max(begins[-1], TURN_S), RENEWED_S))
     rows = np.searchsorted(t, begins[: max(len(begins) - 1, 1)])
-    made = [np.diff(column).tolist() for column in (turned_at(every), lasted[every], track.heading[every])]
+    steps = [np.diff(column).tolist() for column in (turned_at(every), lasted[every], track.heading[every])]
     # These are the information matrix of scale - 1 and bias, and the product of information and mean.
     a, b, c = max(before_std[0], SMALLEST_SCALE_STD) ** -2.0, 0.0, before_std[1] ** -2.0
     p = q = scale = bias = 0.0
@@ -486,7 +491,7 @@ def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tu
     lines = []
     for row in rows.tolist():
         until = int(np.searchsorted(every[1:], row, side="right"))
-        for turn, time, truth in zip(*(column[done:until] for column in made), strict=True):
+        for turn, time, truth in zip(*(column[done:until] for column in steps), strict=True):
             spread = MEAN_TO_STD * sizes / count
             missed = truth - turn - scale * turn - bias * time
             std = math.hypot(spread, MISSED_TURN_SHARE * turn)

@@ -56,27 +56,27 @@ def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
 
 
 def prior_of_model(
-    track_width_m: float, fitted_model: FittedModel, turned: FittedModel | None, source: str
+    track_width_m: float, fitted_model: FittedModel, gyro_model: FittedModel | None, source: str
 ) -> TermsPrior:
     """Return the prior for the next drive of a robot from its fitted models.
 
     Parameters
     ----------
     track_width_m : track width b
-    fitted_model, turned : models with wheels alone, and with a gyro; None: without one. Terms that both lack have the
-        prior of `prior_of_robots`
+    fitted_model, gyro_model : models with wheels alone, and with a gyro; None: without one. Terms that both lack have
+        the prior of `prior_of_robots`
     source : source of the prior, in a few words
 
     Notes
     -----
     The covariance is the sum of the parameters' covariance and the covariance between drives (`between_drives`).
     """
-    of_robots = prior_of_robots(track_width_m)
-    mean, covariance = _placed(WHEELS_MODEL.terms, of_robots.mean, of_robots.covariance, fitted_model)
+    robots_prior = prior_of_robots(track_width_m)
+    mean, covariance = _placed(WHEELS_MODEL.terms, robots_prior.mean, robots_prior.covariance, fitted_model)
     prior = TermsPrior.of_wheels(track_width_m, mean, covariance, source)
-    if turned is None:
+    if gyro_model is None:
         return prior
-    mean, covariance = _placed(TURNED_MODEL.terms, prior.turned_mean, prior.turned_covariance, turned)
+    mean, covariance = _placed(TURNED_MODEL.terms, prior.turned_mean, prior.turned_covariance, gyro_model)
     return replace(prior, turned_mean=mean, turned_covariance=covariance)
 
 
@@ -85,12 +85,13 @@ def _placed(
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Return mean and covariance of terms; the terms of a fitted model get their prior for a further drive."""
     names = fitted_model.model.terms
-    of_fit = [names.index(name) for name in terms if name in names]
-    at = [terms.index(name) for name in terms if name in names]
+    fit_rows = [names.index(name) for name in terms if name in names]
+    term_rows = [terms.index(name) for name in terms if name in names]
     mean, covariance = mean.copy(), covariance.copy()
-    mean[at] = fitted_model.parameters[of_fit]
-    covariance[at, :] = covariance[:, at] = 0.0
-    covariance[np.ix_(at, at)] = (fitted_model.covariance + between_drives(names))[np.ix_(of_fit, of_fit)]
+    mean[term_rows] = fitted_model.parameters[fit_rows]
+    covariance[term_rows, :] = covariance[:, term_rows] = 0.0
+    next_drive = fitted_model.covariance + between_drives(names)
+    covariance[np.ix_(term_rows, term_rows)] = next_drive[np.ix_(fit_rows, fit_rows)]
     return mean, covariance
 
 

@@ -67,12 +67,12 @@ def constant_std(model: MotionModel) -> Floats:
     return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:CONSTANTS_OF_WHEELS]
 
 
-def heading_wander(turned: Floats, length_m: Floats) -> float:
+def heading_wander(turn_error_rad: Floats, length_m: Floats) -> float:
     """Return the growth of the variance of a heading by slip for each metre [rad^2/m]; 0 for windows of one length.
 
     Parameters
     ----------
-    turned : (w,) turn of a model minus the reference's turn [rad]; length_m : (w,) of the windows
+    turn_error_rad : (w,) turn of a model minus the reference's turn [rad]; length_m : (w,) of the windows
 
     Notes
     -----
@@ -82,8 +82,8 @@ def heading_wander(turned: Floats, length_m: Floats) -> float:
     short, long = float(length_m.min()), float(length_m.max())
     if short == long:
         return 0.0
-    near, far = (mad_std(turned[length_m == length]) ** 2 for length in (short, long))
-    return max(far - near, 0.0) / (long - short)
+    short_variance, long_variance = (mad_std(turn_error_rad[length_m == length]) ** 2 for length in (short, long))
+    return max(long_variance - short_variance, 0.0) / (long - short)
 
 
 def shortening_by_wander(wander: float, length_m: Floats) -> Floats:
@@ -207,7 +207,7 @@ class Fold(NamedTuple):
     ----------
     name, number : name and number, from 0, of the recording, or of the block of distance in which the fold begins
     recording : number of the recording
-    begin_m, end_m : path lengths at begin and end [m]; infinite for a whole recording
+    begin_m, end_m : path lengths at start and end [m]; infinite for a whole recording
     """
 
     name: str
@@ -361,10 +361,10 @@ class PooledFit(FittedModel):
     @cached_property
     def _by_recording(self) -> tuple[Floats, Floats]:
         """Gradient (r, k) and curvature (r, k, k) of each recording, with its constants eliminated."""
-        at = self.solution
+        solution = self.solution
         both = [self._derivatives(self.pool.rows(i)) for i in range(len(self.pool.windows))]
         gradients, curvatures = (np.array(column) for column in zip(*both, strict=True))
-        return gradients + at.own_prior_gradient, curvatures + at.own_prior
+        return gradients + solution.own_prior_gradient, curvatures + solution.own_prior
 
     @cached_property
     def curvature(self) -> Floats:
@@ -374,8 +374,8 @@ class PooledFit(FittedModel):
 
     def _derivatives(self, rows: Bools | slice) -> tuple[Floats, Floats]:
         """Return the first and second derivatives of the loss of some residuals."""
-        at = self.solution
-        residuals, jacobian, scale = at.residuals[rows], at.jacobian[rows], at.scale[rows]
+        solution = self.solution
+        residuals, jacobian, scale = solution.residuals[rows], solution.jacobian[rows], solution.scale[rows]
         weights = robust_weights(residuals, scale, self.pool.overlap)
         # The second derivative of soft L1 is the cube of its weight.
         curvature, _ = normal_equations(residuals, jacobian, weights * soft_l1_weights(residuals / scale) ** 2)

@@ -84,7 +84,7 @@ class Table(NamedTuple):
     rows : one cell for each column; a row of a searched table may have fewer cells, of which the last is a sentence
     head : names of the columns; empty: none
     caption : sentence about the content
-    moments : begin of each row [s], which a page shows on its map; empty: no times
+    moments : start of each row [s], which a page shows on its map; empty: no times
     search : for each row the `words` that a page searches, and by name the values for its lists of choices. A page also
         sorts such a table; empty: it does neither
     folded : names of the columns that a page shows only after a click

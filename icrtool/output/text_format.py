@@ -82,8 +82,8 @@ def jump_lines(jumps: Sequence[ReferenceJumpDocument]) -> list[str]:
 
 
 def _jump_size(jump: ReferenceJumpDocument) -> str:
-    turned = f"{abs(jump.turn_deg):.0f}°"
-    return turned if jump.kind == "heading" else f"{error_text(jump.size_m)} and {turned}"
+    turn_text = f"{abs(jump.turn_deg):.0f}°"
+    return turn_text if jump.kind == "heading" else f"{error_text(jump.size_m)} and {turn_text}"
 
 
 def jump_count(jumps: Sequence[ReferenceJumpDocument]) -> str:
@@ -102,9 +102,9 @@ def xml_text(text: str) -> str:
     return _NOT_XML.sub("?", text)
 
 
-def signed_text(metres: float, digits: int = 3) -> str:
+def signed_text(value: float, digits: int = 3) -> str:
     """Return a number with its sign, by default to the millimetre, with a typographic minus instead of a hyphen."""
-    return f"{metres:+.{digits}f}".replace("-", "−") if round(metres, digits) else f"{0:.{digits}f}"
+    return f"{value:+.{digits}f}".replace("-", "−") if round(value, digits) else f"{0:.{digits}f}"
 
 
 def plus_minus(value: float | None, std: float | None, digits: int = 3, sign: str = "+") -> str:
@@ -119,10 +119,10 @@ def duration_text(seconds: float) -> str:
     """Return a duration as ``12.3 s``, ``14:59 min`` or ``3:07:40 h``."""
     if seconds < 60:
         return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60}:{whole % 60:02d} min"
-    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d} h"
+    whole_s = round(seconds)
+    if whole_s < 3600:
+        return f"{whole_s // 60}:{whole_s % 60:02d} min"
+    return f"{whole_s // 3600}:{whole_s // 60 % 60:02d}:{whole_s % 60:02d} h"
 
 
 def driven_text(drive: DriveDocument) -> str:

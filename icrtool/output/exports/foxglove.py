@@ -255,7 +255,7 @@ def _errors(run: Run, rows: Ints) -> write_log.TopicPlan:
 
 
 def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore) -> write_log.TopicMessages:
-    """Return a message at the begin of each event, and a message of kind ``none`` at its end."""
+    """Return a message at the start of each event, and a message of kind ``none`` at its end."""
     stamps, payload = [], []
     for event in events:
         for kind, stamp in ((event["kind"], event["begin_ns"]), ("none", event["end_ns"])):

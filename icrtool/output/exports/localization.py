@@ -116,18 +116,18 @@ def _matrix(numbers: Localization) -> list[str]:
 def _used(key: str, names: set[str]) -> list[str]:
     """Return the lines that state which values of a message are used."""
     words = ["true" if name in names else "false" for name in STATE]
-    rows = [", ".join(words[at : at + 3]) for at in range(0, len(STATE), 3)]
+    rows = [", ".join(words[first : first + 3]) for first in range(0, len(STATE), 3)]
     return [f"    {key}:", f"      [{rows[0]},", *(f"       {row}," for row in rows[1:-1]), f"       {rows[-1]}]"]
 
 
 def _antenna(numbers: Localization) -> list[str]:
     """Return comments with the command that publishes the place of the antenna; none where it is not known."""
-    if (at := numbers.antenna) is None:
+    if (antenna := numbers.antenna) is None:
         return []
-    place = f"--x {at.forward_m:.3f} --y {at.left_m:.3f} --z 0.0"
+    offset_text = f"--x {antenna.forward_m:.3f} --y {antenna.left_m:.3f} --z 0.0"
     return [
-        *_comment(f"Antenna ({at.source}; its height is not shown; gps: the frame_id of your fixes):"),
-        f"# ros2 run tf2_ros static_transform_publisher {place} --frame-id base_link --child-frame-id gps",
+        *_comment(f"Antenna ({antenna.source}; its height is not shown; gps: the frame_id of your fixes):"),
+        f"# ros2 run tf2_ros static_transform_publisher {offset_text} --frame-id base_link --child-frame-id gps",
     ]
 
 

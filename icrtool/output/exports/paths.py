@@ -278,8 +278,8 @@ def _state_features(run: Run, globe: Globe) -> Iterator[Feature]:
     names = ["t_s", "distance_m", "heading_deg", "v_left_mps", "v_right_mps", "std_north_m", "std_east_m"]
     names += [name for icr in ICR_COLUMNS for name in (icr, f"std_{icr}")]
     for name in names:
-        turned = name == "heading_deg"
-        column = np.mod(np.degrees(table.heading_rad[rows]), 360.0) if turned else getattr(table, name)[rows]
+        is_heading = name == "heading_deg"
+        column = np.mod(np.degrees(table.heading_rad[rows]), 360.0) if is_heading else getattr(table, name)[rows]
         columns[name] = column.tolist()
     for model, errors in errors_from_states(run, ERROR_HORIZON_M).items():
         columns[f"{model}_error_{ERROR_HORIZON_M:g}m_m"] = errors[rows].tolist()

@@ -332,7 +332,7 @@ class FleetNumbers(NamedTuple):
     points : the logs with a date and both lateral ICRs
     errors_m : 95 % error after 10 m of each log, by group and name
     model : the model of these errors
-    starts_utc : begin of each log by its name, where it is known
+    starts_utc : start of each log by its name, where it is known
     intervals_m : 95 % interval of the error of each log by its name, where it is known
     """
 

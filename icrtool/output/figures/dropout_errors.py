@@ -182,12 +182,12 @@ def _write_end(axes: Axes, report: DropoutReport, first: ModelResult) -> None:
         why = report.document.trials[last + 1].why_none or "none of this row"
         texts.append((last, f"no trials beyond {horizons_m[last]:g} m: {why.partition(' (')[0]}"))
     for row, text in texts:
-        at, label_left = float(horizons_m[row]), float(horizons_m[row]) > 0.5 * float(horizons_m[-1])
-        axes.axvline(at, **END_LINE)
+        horizon_m, label_left = float(horizons_m[row]), float(horizons_m[row]) > 0.5 * float(horizons_m[-1])
+        axes.axvline(horizon_m, **END_LINE)
         wrapped = textwrap.fill(UNIT_SPACE.sub("\\1\N{NO-BREAK SPACE}m", text), END_CHARACTERS)
         look: style.Look = {"ha": "right" if label_left else "left", "va": "bottom", "fontsize": 8.0, "color": "0.25"}
         axes.annotate(
-            wrapped, (at, 0.0), (-4.0 if label_left else 4.0, 5.0), textcoords="offset points", zorder=6,
+            wrapped, (horizon_m, 0.0), (-4.0 if label_left else 4.0, 5.0), textcoords="offset points", zorder=6,
             xycoords=axes.get_xaxis_transform(), **look,
         )  # fmt: skip
 

@@ -216,7 +216,7 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
     for outage in outages:
         kind = outage.document.kind
         draw_path(axes, outage.north_m, outage.east_m, cell, OUTAGES[kind], zorder=3, label=f"{kind} outage")
-    for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
+    for row, fill, label in ((0, "white", "its start"), (-1, "black", "its end")):
         ends = [(outage.east_m[row], outage.north_m[row]) for outage in outages]
         axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **style.spot_look(fill))
     # Number and end error are written near the end of each outage if there is space; the tables hold all of them.

@@ -80,7 +80,9 @@ def icr_estimates(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     """
     finals, stds = run.document.icr.final, run.document.icr.final_std
     ends = ", ".join(
-        f"{ICR_WORDS[column]} {signed_text(at)} m" for column in ICR_COLUMNS if (at := finals[column]) is not None
+        f"{ICR_WORDS[column]} {signed_text(final_m)} m"
+        for column in ICR_COLUMNS
+        if (final_m := finals[column]) is not None
     )
     unknown = ", ".join(ICR_WORDS[column] for column in ICR_COLUMNS if finals[column] is None)
     title = f"The ICRs end at {ends}{f'; not shown: {unknown}' if unknown else ''}"
@@ -149,7 +151,7 @@ def _draw_estimate(
 ) -> None:  # fmt: skip
     """Draw one estimate over a span.
 
-    The `first` panel also has b/2 and the begin and end of the convergence, the `last` one the ICR of the whole drive.
+    The `first` panel also has b/2 and the start and end of the convergence, the `last` one the ICR of the whole drive.
     """
     table, unit = run.table, _time_axis(span_s[1] - span_s[0])[1]
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))

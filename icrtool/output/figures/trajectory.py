@@ -71,7 +71,7 @@ FIX_LOOKS: dict[int, style.Look] = {
 """Markers of used fixes, by class."""
 
 SLIP_LOOK: style.Look = style.spot_look("none", 6.5, "D", style.FLOAT_COLOR) | {"markeredgewidth": 1.6, "zorder": 4.6}
-"""Marker of the begin of a slip event."""
+"""Marker of the start of a slip event."""
 
 REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
 """Marker of rejected fixes. Shape and luminance distinguish the markers of all classes."""
@@ -128,7 +128,7 @@ def trajectory(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
         ends_m = path.east_m[-1:].copy(), path.north_m[-1:].copy()
         axes.plot(*ends_m, marker="D", color=pen["color"], markersize=5.0, zorder=4.8)
     _draw_jumps(axes, run)
-    # A slip event is drawn as the filter's path through it, with a mark at its begin.
+    # A slip event is drawn as the filter's path through it, with a mark at its start.
     for event in run.sensors.events:
         rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
         if rows.any():

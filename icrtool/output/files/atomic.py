@@ -38,7 +38,7 @@ PACKED_BEGINNINGS = (b"\x28\xb5\x2f\xfd", b"\x1f\x8b", b"BZh", b"\x04\x22\x4d\x1
 """First bytes of files packed with zstd, gzip, bzip2 and lz4. icrtool writes no packed file: it may be a user's log."""
 
 RECOGNISED_BYTES = 4096
-"""Number of bytes that are read from the begin of a file to recognise it."""
+"""Number of bytes that are read from the start of a file to recognise it."""
 
 HIDDEN = ".icrtool-"
 """First characters of the names of files that icrtool uses while it writes results."""

@@ -387,7 +387,7 @@ def _attitude(columns: dict[str, NDArray[Any]], gyro: GyroSamples | None) -> Hea
 
 
 def spans_of(pairs: object) -> Ints:
-    """Return the spans in a run.json as an array (k, 2) of begins and ends [ns]."""
+    """Return the spans in a run.json as an array (k, 2) of starts and ends [ns]."""
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 

@@ -189,9 +189,9 @@ def _held_out_table(calibration: Calibration) -> Table:
 def _left_out_table(calibration: Calibration) -> Table:
     """Return p95 and expected error by horizon of each log or block, predicted by a fit without it."""
     horizons = sorted({score.horizon_m for score in calibration.held_out_pooled})
-    each = {(score.log, score.horizon_m): score for score in calibration.held_out if score.model == MAIN_ROW}
+    score_of = {(score.log, score.horizon_m): score for score in calibration.held_out if score.model == MAIN_ROW}
     names = dict.fromkeys(score.log for score in calibration.held_out)
-    rows = [(name, *(_errors_text(each.get((name, horizon))) for horizon in horizons)) for name in names]
+    rows = [(name, *(_errors_text(score_of.get((name, horizon))) for horizon in horizons)) for name in names]
     caption = f"95 % / expected error [m] of {MAIN_ROW}, each log or block of distance predicted without itself"
     return Table("lr", rows, ("left out", *(f"{horizon:g} m" for horizon in horizons)), caption)
 
@@ -213,10 +213,10 @@ def held_out_blocks(table: HeldOut) -> list[Block]:
         part, tested = "log", "each log left out in turn"
     rows = []
     for row in table.scores:
-        cells, of_all = [], row.together
-        for h, trials in enumerate(of_all.trials):
+        cells, together = [], row.together
+        for h, trials in enumerate(together.trials):
             worst = f"{row.worst('p95', h):.2f}/{row.worst('expected', h):.2f}" if trials else ""
-            cells.append(f"{of_all.p95[h]:.2f}/{of_all.expected[h]:.2f} ({worst})" if trials else "–")
+            cells.append(f"{together.p95[h]:.2f}/{together.expected[h]:.2f} ({worst})" if trials else "–")
         rows.append((row.name, *cells))
     return [
         f"{tested} ({len(table.folds)} {part}s): 95 % / expected error [m] of all trials (of the worst {part})",
@@ -344,8 +344,10 @@ def forecast_blocks(
         "",
     ]
     for budget in budgets_m:
-        far = [(suffix, distance_within(along, budget)) for suffix, along in kinds]
-        reached = [f"{'all of it' if metres >= total else f'{metres:.1f} m'}{suffix}" for suffix, metres in far]
+        distances = [(suffix, distance_within(along, budget)) for suffix, along in kinds]
+        reached = [
+            f"{'the whole path' if metres >= total else f'{metres:.1f} m'}{suffix}" for suffix, metres in distances
+        ]
         blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
     if total > (longest := measured_to_m(calibration)):
         blocks.append(f"errors were measured up to {longest:g} m; errors beyond are extrapolated")
@@ -459,8 +461,8 @@ SEEN_HALF_WIDTHS = (1.96 + 0.84) / 1.96
 
 QUANTITY_WORDS = {
     **{name: f"ICR {word} [m]" for name, word in ICR_WORDS.items()},
-    "multiplier": "multiplier", "radius_left": "left wheel radius, of the configured",
-    "radius_right": "right wheel radius, of the configured",
+    "multiplier": "multiplier", "radius_left": "left wheel radius / configured",
+    "radius_right": "right wheel radius / configured",
 }  # fmt: skip
 """Words for the quantities of a comparison."""
 

@@ -121,10 +121,10 @@ def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Secti
     for trial in report.worst[:1]:
         note = _meanwhile(trial, summary, report)
         driven = f"{trial.horizon_m:g} m from {duration_text(trial.t_s)} on"
-        turned = f"turning {turn_text(trial.heading_change_deg)} at {trial.speed_mean_mps:.2f} m/s"
-        by = f"with {trial.model}{f'; meanwhile: {note}' if note else ''}"
+        turns_text = f"turning {turn_text(trial.heading_change_deg)} at {trial.speed_mean_mps:.2f} m/s"
+        model_text = f"with {trial.model}{f'; meanwhile: {note}' if note else ''}"
         error = error_text(trial.errors_m[trial.model])
-        text = f"after {driven}, {turned}, {by}"
+        text = f"after {driven}, {turns_text}, {model_text}"
         cards.append(Section("Where was it worst?", [], lead=error, text=text, label="Worst", name="worst-case"))
     return cards
 
@@ -224,9 +224,10 @@ def heading_lines(report: DropoutDocument) -> Iterator[str]:
     """Yield a line with the remedy if the heading at the start causes most of the error of the best row."""
     start_heading = UNSET if report.best is None else report.best.start_heading
     if report.best is not None and start_heading is not UNSET and start_heading.dominates:
-        whole = f"{error_text(start_heading.p95_m)} after {report.best.horizon_m:g} m (95 %)"
-        aligned = f"{error_text(start_heading.aligned_p95_m)} with aligned headings"
-        yield f"the heading at the start causes most of the error: {whole}, but {aligned}; {start_heading.mend}"
+        total_text = f"{error_text(start_heading.p95_m)} after {report.best.horizon_m:g} m (95 %)"
+        aligned_text = f"{error_text(start_heading.aligned_p95_m)} with aligned headings"
+        errors_text = f"{total_text}, but {aligned_text}"
+        yield f"the heading at the start causes most of the error: {errors_text}; {start_heading.mend}"
 
 
 def sensor_lines(report: DropoutDocument) -> Iterator[str]:

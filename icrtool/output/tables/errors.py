@@ -144,9 +144,9 @@ def _source_lines(report: DropoutDocument) -> Iterator[str]:
     rows, icr = [row for row in report.reference_error if row.p95_m is not None], model_of(report, "icr")
     if rows and icr is not None:
         nearest = min(rows, key=lambda row: abs(row.horizon_m - CHOICE_HORIZON_M))
-        whole = next(row.p95_m for row in icr.by_horizon if row.horizon_m == nearest.horizon_m)
-        error_words = f"the {error_text(whole)} of icr (95 %, {nearest.horizon_m:g} m)"
-        yield f"up to {error_text(nearest.p95_m)} of {error_words} can be the error of the position reference"
+        icr_p95_m = next(row.p95_m for row in icr.by_horizon if row.horizon_m == nearest.horizon_m)
+        error_words = f"icr, 95 % after {nearest.horizon_m:g} m: {error_text(icr_p95_m)}"
+        yield f"{error_words}, of which the position reference can explain up to {error_text(nearest.p95_m)}"
 
 
 def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]:
@@ -154,15 +154,15 @@ def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]
     smoothed = "; compared with the smoothed trajectory, which knows all of the drive"
     reference = smoothed if report.request.reference == "smoothed" else ""
     moving = "moving " if report.request.starts == "moving" else ""
-    yield f"a trial from each {moving}state of {report.starts:,}, by wheel speeds alone{reference}"
+    yield f"one trial from each {moving}state ({report.starts:,} states), by wheel speeds alone{reference}"
     if model_of(report, "no_slip") is None:
         yield "no_slip is left out: robot.track_width_m is not known"
     if summary.config.robot.skid_factor is not None and model_of(report, "vendor") is None:
         yield f"vendor is left out: {why_no_vendor(summary)}"
     if report.starts_standing > NOTED_STANDING * report.starts:
         share = 100 * report.starts_standing / report.starts
-        each = "each standstill is one start" if moving else "each is a start (--starts all)"
-        yield f"the robot stood at {share:.0f} % of the states: {each}"
+        standing_text = "each standstill is one start" if moving else "each is a start (--starts all)"
+        yield f"the robot stood at {share:.0f} % of the states: {standing_text}"
     if summary.reference_jumps and report.request.with_jumps:
         yield "trials across jumps of the reference count"
     yield from _event_lines(report, summary)

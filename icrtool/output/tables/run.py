@@ -86,7 +86,7 @@ def format_run(run: Run) -> str:
 def run_blocks(summary: RunDocument) -> list[Block]:
     """Return the output of `icrtool fit` as blocks: usability, numbers, checks, and sources of the numbers."""
     excitation = summary.excitation
-    turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
+    turns_text = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
     driven = f"{distance_text(summary.drive.distance_m)}, {duration_text(summary.drive.duration_s)}"
     verdict = "" if not summary.usable else "PARTLY" if summary.partly_because else "USABLE"
     grounds = unstated_grounds(summary) if summary.usable else ()
@@ -102,7 +102,7 @@ def run_blocks(summary: RunDocument) -> list[Block]:
     inputs = "; ".join(f"{topic} ({', '.join(taken)})" for topic, taken in roles.items())
     return [
         unusable_line(summary),
-        Title(run_title(summary), f"{driven}, turned {turned}"),
+        Title(run_title(summary), f"{driven}, turned {turns_text}"),
         Line("\n".join(lines) or verdict, "good" if summary.usable else "as is"),
         Facts(_stretch_rows(grounds)),
         *(number_blocks(summary) if summary.usable else ()),
@@ -194,7 +194,7 @@ def blocks_of_numbers(
     multiplier = plus_minus(numbers.multiplier, numbers.multiplier_std, sign="")
     rows = [
         ("wheel_separation_multiplier", f"{multiplier}, next drive ± {numbers.multiplier_next_std:.2g}"),
-        ("left, right wheel radius", f"{radii} ± {std:.3f} of the configured"),
+        ("left, right wheel radius", f"{radii} ± {std:.3f} times the configured radius"),
     ]
     without = f"(right - left) / {width_m:g} m is the multiplier; without slip: ±{width_m / 2:.3g} m"
     return [Facts(rows, "controller"), Facts([_icr_row(icrs), ("", without)])]
@@ -221,8 +221,8 @@ def run_checks(summary: RunDocument) -> list[Check]:
         kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(event.kind for event in events).items())
         worst = max(events, key=lambda event: (event.end_s - event.begin_s) * event.severity)
         lasted = duration_text(worst.end_s - worst.begin_s)
-        missed = f"{100 * worst.severity:.0f} % of the wheels' motion missed"
-        most = f"worst: {worst.kind} from {worst.begin_s:.1f} s for {lasted}, {missed}"
+        missed_text = f"{100 * worst.severity:.0f} % of the wheels' motion missed"
+        most = f"worst: {worst.kind} from {worst.begin_s:.1f} s for {lasted}, {missed_text}"
         checks.append(Check("care", "slip events", f"{kinds}; left out of the fit", (most,)))
     return checks
 
@@ -233,12 +233,12 @@ def _filter_check(summary: RunDocument) -> Iterator[Check]:
     ends, apart = [], []
     for column in ICR_COLUMNS:
         word = ICR_WORDS[column]
-        at, at_std, of_drive = final[column], final_std[column], summary.icr_of_drive(column)
-        if of_drive is None or at is None or at_std is None:
+        final_value, final_value_std, of_drive = final[column], final_std[column], summary.icr_of_drive(column)
+        if of_drive is None or final_value is None or final_value_std is None:
             continue
         value, std = of_drive
-        ends.append(f"{word.removeprefix('y ')} {at:+z.3f}")
-        sigmas = abs(at - value) / max(math.hypot(std, at_std), 1e-9)
+        ends.append(f"{word.removeprefix('y ')} {final_value:+z.3f}")
+        sigmas = abs(final_value - value) / max(math.hypot(std, final_value_std), 1e-9)
         if sigmas > AGREES_SIGMAS:
             apart.append(f"{word} differs by {sigmas:.1f} σ: the end of the drive is not like the whole")
     if ends and unstated_grounds(summary):
@@ -328,7 +328,9 @@ def _delay_checks(summary: RunDocument) -> Iterator[Check]:
     speed = summary.drive.speed_mean_mps
     if summary.gnss.delay_s is None and summary.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
         shift = error_text(TYPICAL_DELAY_S * speed)
-        lines.append(f"of the fixes: not shown by this drive; a lag of {TYPICAL_DELAY_S:g} s would move x by {shift}")
+        lines.append(
+            f"fixes: this drive does not show their delay; a lag of {TYPICAL_DELAY_S:g} s would move x by {shift}"
+        )
     if lines:
         yield Check("fact", "delays", lines[0], tuple(lines[1:]))
 
@@ -340,7 +342,8 @@ def corrections(summary: RunDocument) -> list[str]:
     texts = [f"wheels {100 * scale:.1f} %"] if abs(scale - 1.0) > NOTED_SCALE else []
     if abs(left - right) > NOTED_SCALE:
         side, share = ("left", (right - left) / right) if left < right else ("right", (left - right) / left)
-        texts.append(f"{side} {100 * share:.1f} % less")
+        other_side = "right" if side == "left" else "left"
+        texts.append(f"{side} wheels {100 * share:.1f} % below {other_side}")
     if abs(offset := summary.heading.applied_offset_deg) >= SMALLEST_OFFSET_DEG:
         texts.append(f"heading {-offset:+z.1f}°")
     delays = (("position", summary.filter.reference_delay_s), ("heading", summary.heading.applied_delay_s))

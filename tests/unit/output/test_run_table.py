@@ -130,7 +130,7 @@ def test_lengths_read_well() -> None:
 def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: Run) -> None:
     steady = with_summary(run, gnss={"delay_s": None, "delay_std_s": None})
     speed = run.summary["drive"]["speed_mean_mps"]
-    said = f"not shown by this drive; a lag of 0.1 s would move x by {error_text(0.1 * speed)}"
+    said = f"this drive does not show their delay; a lag of 0.1 s would move x by {error_text(0.1 * speed)}"
     assert said in " ".join(format_run(steady).split())
     known = with_summary(run, gnss={"delay_s": 0.02, "delay_std_s": 0.01})
     assert said not in " ".join(format_run(known).split())
