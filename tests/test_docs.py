@@ -10,6 +10,8 @@ import itertools
 import math
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -176,17 +178,23 @@ def readme_session() -> dict[str, Any]:
     return names | {"whole_report": icrtool.dropout_report(names["run"])}
 
 
-def readme_table(first_cell: str) -> list[list[str]]:
-    """Return the rows below the header of the README's table whose header begins with `first_cell`."""
-    lines = README.partition(f"\n| {first_cell} |")[2].splitlines()[2:]
+def readme_table(first_cell: str, page: str = README) -> list[list[str]]:
+    """Return the rows below the header of the table, in the README or another page, whose header begins with a cell."""
+    lines = page.partition(f"\n| {first_cell} |")[2].splitlines()[2:]
     rows = itertools.takewhile(lambda line: line.startswith("|"), lines)
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
 
 
-def test_the_readmes_errors_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
+RESULTS_PAGE = (ROOT / "docs" / "how-to" / "read-the-result.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("page", "count"), [(README, 4), (RESULTS_PAGE, 8)])
+def test_the_errors_of_a_page_are_those_of_the_sample_log(
+    page: str, count: int, readme_session: dict[str, Any]
+) -> None:
     summary = readme_session["whole_report"].summary.set_index(["model", "horizon_m"])
-    rows = readme_table("row")
-    assert len(rows) == 8
+    rows = readme_table("row", page)
+    assert len(rows) == count
     for row in rows:
         model = row[0].split("`")[1]
         found = [f"{summary.loc[(model, horizon), 'p95_m']:.3f}" for horizon in (1, 5, 10, 20)]
@@ -226,8 +234,16 @@ def test_the_lines_of_the_first_change_stand_in_the_files_they_name() -> None:
 
 
 def test_the_page_on_results_shows_the_distances_of_the_readme() -> None:
-    page = (ROOT / "docs" / "how-to" / "read-the-result.md").read_text(encoding="utf-8")
     for row, *cells in readme_table("within 0.5 m (95 %)"):
-        shown = re.search(rf"^ +{row.strip('`')} +(\S+ m) +(\S.*? m(?: or more)?)(?:  |$)", page, re.MULTILINE)
+        shown = re.search(rf"^ +{row.strip('`')} +(\S+ m) +(\S.*? m(?: or more)?)(?:  |$)", RESULTS_PAGE, re.MULTILINE)
         assert shown is not None
         assert list(shown.groups()) == cells
+
+
+def test_the_example_of_make_where_shows_what_the_script_prints() -> None:
+    shown = ARCHITECTURE.partition("$ make where WORDS=decide_jumps\n")[2].partition("```")[0]
+    script = [sys.executable, str(ROOT / "scripts" / "where.py"), "decide_jumps"]
+    printed = subprocess.run(script, capture_output=True, text=True, check=True).stdout
+    # Line numbers change with every edit of the module.
+    assert shown
+    assert re.sub(r":\d+:", "::", shown) == re.sub(r":\d+:", "::", printed)
