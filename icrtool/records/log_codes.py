@@ -159,14 +159,14 @@ OF_CLOCKS: dict[str, Explanation] = {
 OF_WHEELS: dict[str, Explanation] = {
     "ground_changed": Explanation(
         "warning",
-        "The robot turns differently per turn of its wheels from some time on: another ground, load or tyre pressure.",
+        "From some time on, the same turn of the wheels turns the robot by another angle: ground, load or tyre pressure.",
         "ICRs and multiplier of the whole drive lie between the values of its stretches.",
         "Fit with `--terrain-change T`, or each stretch by itself with `--from` and `--to`.",
     ),
     "wheel_clock_differs": Explanation(
         "warning",
         "The delay between wheels and headings grows during the drive: their clocks have different rates.",
-        "Wheels and headings are compared at times that differ by a part of a second or more.",
+        "Wheels and headings are compared at times that differ by a fraction of a second or more.",
         "Put both on one clock; `topics.clock=log` takes log times.",
     ),
     "wheels_limited": Explanation(
