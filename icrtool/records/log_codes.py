@@ -159,7 +159,7 @@ OF_CLOCKS: dict[str, Explanation] = {
 OF_WHEELS: dict[str, Explanation] = {
     "ground_changed": Explanation(
         "warning",
-        "From some time on, the same turn of the wheels turns the robot by another angle: ground, load or tyre pressure.",
+        "From a time on, the same turn of the wheels turns the robot differently: other ground, load or tyre pressure.",
         "ICRs and multiplier of the whole drive lie between the values of its stretches.",
         "Fit with `--terrain-change T`, or each stretch by itself with `--from` and `--to`.",
     ),
