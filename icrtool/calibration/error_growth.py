@@ -122,12 +122,12 @@ def path_errors(
     return PathMoments(moved, turn_rad, of_parameters, _source_moments(path.heading, path.place, s, e))
 
 
-def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> ErrorMoments:
+def _source_moments(theta: Floats, position: Complexes, s: Ints, e: Ints) -> ErrorMoments:
     """Return the moments (w, `SOURCES`) of a unit variance of each source, by sums between knots."""
-    step = np.diff(place)
+    step = np.diff(position)
     length = np.concatenate([[0.0], np.cumsum(np.abs(step))])
     middle_m, middle_rad = (length[1:] + length[:-1]) / 2, (theta[1:] + theta[:-1]) / 2
-    middle = (place[1:] + place[:-1]) / 2
+    middle = (position[1:] + position[:-1]) / 2
 
     def sum_between_knots(values: Values) -> Values:
         """Return the sum of values between the knots of each window."""
@@ -135,30 +135,31 @@ def _source_moments(theta: Floats, place: Complexes, s: Ints, e: Ints) -> ErrorM
         difference: Values = sums[e] - sums[s]
         return difference
 
-    back, went, driven = np.exp(-1j * theta[s]), place[e] - place[s], length[e] - length[s]
-    by_rate = 1j * back * (sum_between_knots(step * middle_m) - length[s] * went)
-    by_turn = 1j * back * (sum_between_knots(step * middle_rad) - theta[s] * went)
+    to_body, displacement, path_length = np.exp(-1j * theta[s]), position[e] - position[s], length[e] - length[s]
+    by_rate = 1j * to_body * (sum_between_knots(step * middle_m) - length[s] * displacement)
+    by_turn = 1j * to_body * (sum_between_knots(step * middle_rad) - theta[s] * displacement)
     constant = [
-        (0.0 * driven, 1j * back * went),
-        (driven, by_rate),
+        (0.0 * path_length, 1j * to_body * displacement),
+        (path_length, by_rate),
         (theta[e] - theta[s], by_turn),
-        (0.0 * driven, back * went),
+        (0.0 * path_length, to_body * displacement),
     ]
     driven_m, first = np.abs(step), sum_between_knots(np.abs(step) * middle)
     zero = sum_between_knots(driven_m)
-    # The sum of q (S_e - S_u)(S_e - S_u)^T along the path is computed as squared length and as square of a complex
-    # number.
+    # The heading error of the wander grows along the path: a step of length q at the point S_u moves the end S_e by
+    # j (S_e - S_u). The sum of q (S_e - S_u)(S_e - S_u)^T is computed as squared length `size` and as square of a
+    # complex number, `square`; `zero` and `first` are the sums of q and of q S_u.
     size = (
-        zero * np.abs(place[e]) ** 2
-        - 2.0 * (np.conj(place[e]) * first).real
+        zero * np.abs(position[e]) ** 2
+        - 2.0 * (np.conj(position[e]) * first).real
         + sum_between_knots(driven_m * np.abs(middle) ** 2)
     )
-    square = (zero * place[e] ** 2 - 2.0 * place[e] * first + sum_between_knots(driven_m * middle**2)) * (
-        1j * back
+    square = (zero * position[e] ** 2 - 2.0 * position[e] * first + sum_between_knots(driven_m * middle**2)) * (
+        1j * to_body
     ) ** 2
-    wander = _from_squares(driven, size, square)
+    wander = _from_squares(path_length, size, square)
     along = np.divide(step**2, driven_m, out=np.zeros(len(step), np.complex128), where=driven_m > 0.0)
-    speed = _from_squares(0.0 * driven, zero, sum_between_knots(along) * back**2)
+    speed = _from_squares(0.0 * path_length, zero, sum_between_knots(along) * to_body**2)
     moments = [ErrorMoments(h**2, p.real**2, p.real * p.imag, p.imag**2) for h, p in constant]
     ones, none = np.ones(len(s)), np.zeros(len(s))
     reference = [ErrorMoments(ones, none, none, none), ErrorMoments(none, ones, none, ones)]

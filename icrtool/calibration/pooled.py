@@ -313,7 +313,16 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return a function that gives the errors of a calibration in trials of a recording, with its own constants."""
+    """Return a function that gives the errors of a calibration in trials of a recording, with its own constants.
+
+    Raises
+    ------
+    ConfigError
+        The robot of the calibration has another track width; or `with_gyro` is set, and calibration or recording has no
+        gyro.
+    DataError
+        The recording is too short.
+    """
     fitted_model = model_for(calibration, recording, with_gyro=with_gyro)
     fit = fitted_model, own_constants(cut_windows(recording), fitted_model, recording.width_m)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]

@@ -182,11 +182,11 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         )
         wheels = with_wheel_speeds(log, Config(robot=robot)).wheels
         v_x, v_y, omega = self.twist(wheels.v_left_mps, wheels.v_right_mps)
-        held = np.diff(wheels.stamp_ns) / 1e9
-        heading = np.concatenate([[0.0], np.cumsum(held * omega[:-1])])
-        moved = held * (v_x + 1j * v_y)[:-1] * np.exp(1j * heading[:-1])
-        place = np.concatenate([[0.0], np.cumsum(moved)])
-        return Odometry(wheels.stamp_ns, place.real, place.imag, heading)
+        duration_s = np.diff(wheels.stamp_ns) / 1e9
+        heading = np.concatenate([[0.0], np.cumsum(duration_s * omega[:-1])])
+        step = duration_s * (v_x + 1j * v_y)[:-1] * np.exp(1j * heading[:-1])
+        position = np.concatenate([[0.0], np.cumsum(step)])
+        return Odometry(wheels.stamp_ns, position.real, position.imag, heading)
 
     def warm_start(self) -> WarmStart:
         """Return the three ICRs [m] and their covariance [m^2] for a filter to begin with (`icrtool.fit`)."""

@@ -367,14 +367,14 @@ def _errors_turned(
             continue
         first = int(trials.starts[line_trials.start])
         rows = slice(first, last + 1)
-        psi, place = turned_path(run, recording, scale * turn_by_gyro[rows] + bias * duration_s[rows], rows)
+        psi, position = turned_path(run, recording, scale * turn_by_gyro[rows] + bias * duration_s[rows], rows)
         for h in range(trials.ends.shape[1]):
             tried = line_trials.start + np.flatnonzero(trials.ends[line_trials, h] >= 0)
             s, e = trials.starts[tried], trials.ends[tried, h]
             right, left, x = (column if len(column) == 1 else column[s] for column in icrs)
             arm = (right + left) / 2.0 - 1j * x
             begin, end = psi[s - first], psi[e - first]
-            moved = place[e - first] - place[s - first] - 1j * arm * (np.exp(1j * end) - np.exp(1j * begin))
+            moved = position[e - first] - position[s - first] - 1j * arm * (np.exp(1j * end) - np.exp(1j * begin))
             driven = track.north[e] - track.north[s] + 1j * (track.east[e] - track.east[s])
             errors.position[tried, h] = np.abs(np.exp(1j * (track.heading[s] - begin)) * moved - driven)
             errors.heading[tried, h] = np.abs(end - begin - track.heading[e] + track.heading[s])

@@ -242,6 +242,6 @@ def summary_of(rows: Sequence[FleetLog], output: Path, written: str) -> str:
     parts = [fleet_files.counts_text(rows)]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
-    place = f"written to {LogText(str(output))}: {written}"
-    lines = textwrap.wrap(place, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    written_text = f"written to {LogText(str(output))}: {written}"
+    lines = textwrap.wrap(written_text, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     return "\n".join(["", f"{counted(len(rows), 'log')}: {', '.join(parts)}", *lines])

@@ -111,14 +111,21 @@ def dropout_report(
     Parameters
     ----------
     run : result of `icrtool.fit` or `icrtool.open_run`
-    horizons_m, budgets_m : distances without GNSS [m]; largest allowed errors [m], for which the distance is reported
-    gates, strict_gates, allow_unusable : acceptance limits, and how they are checked
-    outage_s, outage_at_s : lengths and start times of forced outages [s]
-    starts, reference : states that trials start from; estimates that trials are compared with
-    without_events, with_jumps : leave out trials across slip events; count trials across jumps of the reference
+    horizons_m : distances without GNSS [m]; None: from the configuration
+    budgets_m : largest allowed errors [m], for which the distance is reported
+    gates : acceptance limits, as text or as `Gate`
+    strict_gates : check limits relative to `baseline` by the number alone, without its interval
+    allow_unusable : report all rows and distances of a run that is not usable, too
+    outage_s : lengths of forced outages [s]; None: from the configuration
+    outage_at_s : start times of forced outages since the first state [s]; empty: evenly spaced
+    starts : states that trials start from
+    reference : estimates that trials are compared with
+    without_events : leave out trials across slip events
+    with_jumps : count trials across jumps of the reference
     refit_sensors : refit heading offset, delays and gyro bias of `calibrations` in this log
-    ladder, seed : test models on held-out distance; seed of the random draws
+    ladder : test models on held-out distance
     score : topics of poses in the log; each becomes a row ``topic:NAME``
+    seed : seed of the random draws
     log : the log of the run, as `icrtool.read_log` takes it; scored topics are read from it
     calibrations : results of `icrtool.calibrate` or `icrtool.open_calibration`. Each becomes a row ``calibration``; one
         of several becomes ``calibration:STEM`` with the stem of its file. If calibration and log have a gyro, there is

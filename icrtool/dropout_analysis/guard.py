@@ -24,12 +24,12 @@ LARGEST_ROW_RATIO = 3.0
 """Ratio of the errors of `recommended` and `icr` above which the two rows contradict each other."""
 
 
-def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterable[str]) -> Note | None:
+def why_unusable(document: RunDocument, errors: OpenLoopErrors, held_out: Iterable[str]) -> Note | None:
     """Return why the rows of a report must not be used; None if they can be used.
 
     Parameters
     ----------
-    summary : document of the run
+    document : document of the run
     errors : errors of the rows
     held_out : names of the rows that are tested on distance that they were not fitted to
 
@@ -47,7 +47,7 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
     compared = enough if len(enough) else np.arange(len(errors.horizons_m))
     h = int(compared[np.abs(errors.horizons_m[compared] - CHOICE_HORIZON_M).argmin()])
     horizon, least = f"{errors.horizons_m[h]:g} m", int(trials[:, h].argmin())
-    seconds = int(errors.counts.trials[h]) * summary.drive.duration_s / max(errors.states, 1)
+    seconds = int(errors.counts.trials[h]) * document.drive.duration_s / max(errors.states, 1)
     expected = min(int(errors.counts.trials[h]), seconds / LONGEST_RECORDING_STEP_S, MOST_TRIALS)
     if trials[least, h] < max(FEWEST_TRIALS, SMALLEST_SHARE_TRIED * expected):
         few = f"{names[least]} has only {trials[least, h]:,} trials of {horizon}"
@@ -55,7 +55,7 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
             return note("few_trials", f"{few}: the drive is too short; drive further")
         of_icr = f"and icr has {errors.counts.trials[h]:,}"
         return note("few_trials", f"{few}, {of_icr}; check the stamps of the wheels (icrtool info -v)")
-    hidden = [ICR_WORDS[column] for column in ICR_COLUMNS[:2] if summary.icr_of_drive(column) is None]
+    hidden = [ICR_WORDS[column] for column in ICR_COLUMNS[:2] if document.icr_of_drive(column) is None]
     icr, recommended = (rows[name][h].p95_m if name in rows else None for name in (FALLBACK_ROW, MAIN_ROW))
     if not hidden or icr is None or recommended is None:
         return None

@@ -178,9 +178,9 @@ def _departure(positions: Complexes, reference: Complexes, distance: Floats) -> 
     return Departure(drive_misfit, float(np.exp(logs.mean())), float(logs.std(ddof=1)) / math.sqrt(PIECES))
 
 
-def _misfit(place: Complexes, reference: Complexes) -> float:
+def _misfit(positions: Complexes, reference: Complexes) -> float:
     """Return the rms distance [m] of places (n,) from a reference (n,) after best turn, scale, shift (Umeyama 1991)."""
-    ours, theirs = place - place.mean(), reference - reference.mean()
-    size = float(np.vdot(ours, ours).real)
-    fitted = ours * (np.vdot(ours, theirs) / size) if size > 0.0 else 0.0
-    return float(np.sqrt(np.mean(np.abs(theirs - fitted) ** 2)))
+    centred, target = positions - positions.mean(), reference - reference.mean()
+    size = float(np.vdot(centred, centred).real)
+    fitted = centred * (np.vdot(centred, target) / size) if size > 0.0 else 0.0
+    return float(np.sqrt(np.mean(np.abs(target - fitted) ** 2)))

@@ -180,21 +180,21 @@ def measure_gaps(table: States, in_gap: Bools, sensors: SensorData, used: Bools)
         return GapPaths(rows, np.zeros(len(rows)), 0.0, 0.0)
     forward, right = sensors.facts.antenna_m
     heading = np.interp(seen.stamp_ns, sensors.headings.stamp_ns, unwrapped(sensors.headings.heading_rad))
-    body = seen.north_m + 1j * seen.east_m - (forward + 1j * right) * np.exp(1j * heading)
+    robot_positions = seen.north_m + 1j * seen.east_m - (forward + 1j * right) * np.exp(1j * heading)
     step_m = max(SHORTEST_STEP_M, STEP_IN_STD * float(np.sqrt(np.median(seen.var_north_m2 + seen.var_east_m2))))
-    place, beyond_m, unseen_s, unseen_m = table.north_m + 1j * table.east_m, np.zeros(len(rows)), 0.0, 0.0
+    positions, beyond_m, unseen_s, unseen_m = table.north_m + 1j * table.east_m, np.zeros(len(rows)), 0.0, 0.0
     for gap, row in enumerate(rows.tolist()):
         first, last = np.searchsorted(seen.stamp_ns, table.stamp_ns[row : row + 2], side="right").tolist()
         if last > first:
-            path = np.concatenate([place[row : row + 1], body[first:last], place[row + 1 : row + 2]])
+            path = np.concatenate([positions[row : row + 1], robot_positions[first:last], positions[row + 1 : row + 2]])
             chosen = chord_rows(path.real.copy(), path.imag.copy(), step_m)
             length = np.abs(np.diff(path[chosen])).sum() + np.abs(path[-1] - path[chosen[-1]])
-            beyond_m[gap] = max(float(length - np.abs(place[row + 1] - place[row])), 0.0)
-        elif last < len(body):
+            beyond_m[gap] = max(float(length - np.abs(positions[row + 1] - positions[row])), 0.0)
+        elif last < len(robot_positions):
             # The filter follows the robot at the first fix after the gap.
             after = int(np.searchsorted(table.stamp_ns, seen.stamp_ns[last]))
             driven = float(table.distance_m[min(after, len(table) - 1)] - table.distance_m[row + 1])
-            moved = float(np.abs(body[last] - place[row])) - driven
+            moved = float(np.abs(robot_positions[last] - positions[row])) - driven
             noise = math.hypot(float(table.std_north_m[row]), float(table.std_east_m[row]))
             if moved > max(step_m, STEP_IN_STD * noise):
                 unseen_s, unseen_m = unseen_s + float(table.t_s[row + 1] - table.t_s[row]), unseen_m + moved

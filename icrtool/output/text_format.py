@@ -39,30 +39,30 @@ MOST_LINES = 50
 """Largest number of jumps of the reference that are printed; jumps of decided cause come first, then larger ones."""
 
 
-def run_title(summary: RunDocument) -> str:
-    """Return the log's name, and the robot's where it has one, from a run's `summary`."""
-    log, robot = summary.log, summary.config.robot.name
+def run_title(document: RunDocument) -> str:
+    """Return the log's name, and the robot's where it has one, from a run's `document`."""
+    log, robot = document.log, document.config.robot.name
     return f"{log}  ({robot})" if robot else str(log)
 
 
-def position_word(summary: RunDocument) -> str:
+def position_word(document: RunDocument) -> str:
     """Return the words for the position measurements: ``GNSS fixes``, or ``position reference`` for metric poses."""
-    return "GNSS fixes" if summary.gnss.datum is not None else "position reference"
+    return "GNSS fixes" if document.gnss.datum is not None else "position reference"
 
 
-def fix_word(summary: RunDocument) -> str:
+def fix_word(document: RunDocument) -> str:
     """Return the word for the missing stream of an outage: ``GNSS``, or ``position`` for a metric reference."""
-    return "GNSS" if summary.gnss.datum is not None else "position"
+    return "GNSS" if document.gnss.datum is not None else "position"
 
 
-def direction_words(summary: RunDocument | None) -> tuple[str, str]:
+def direction_words(document: RunDocument | None) -> tuple[str, str]:
     """Return the names of the axes across and up a map: ``East``, ``North``; of a frame without datum ``x``, ``y``."""
-    return ("East", "North") if summary is None or summary.gnss.datum is not None else ("x", "y")
+    return ("East", "North") if document is None or document.gnss.datum is not None else ("x", "y")
 
 
-def role_word(summary: RunDocument, role: Role) -> str:
+def role_word(document: RunDocument, role: Role) -> str:
     """Return the word for the stream of a role; ``position`` for a metric reference, which is not called GNSS."""
-    return ROLE_WORDS[role] if summary.gnss.datum is None else role
+    return ROLE_WORDS[role] if document.gnss.datum is None else role
 
 
 def topics_text(topics: str) -> str:
@@ -126,7 +126,7 @@ def duration_text(seconds: float) -> str:
 
 
 def driven_text(drive: DriveDocument) -> str:
-    """Return distance and duration of a drive, as ``398.5 m in 14:59 min``; `drive` of a run's summary."""
+    """Return distance and duration of a drive, as ``398.5 m in 14:59 min``; `drive` of a run's document."""
     return f"{distance_text(drive.distance_m)} in {duration_text(drive.duration_s)}"
 
 

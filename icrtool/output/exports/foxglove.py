@@ -152,14 +152,14 @@ def _transforms(paths: Sequence[ExportPath], rows: Ints, store: Typestore) -> wr
     fixed: dict[str, object] = {"transforms": [write_log.blank_message(store, message_type) for _ in paths]}
     columns: dict[str, NDArray[Any]] = {}
     for number, path in enumerate(paths):
-        place, (z, w) = f"transforms.{number}", path.quaternion
-        fixed |= {f"{place}.header.frame_id": WORLD, f"{place}.child_frame_id": BODIES[path.name]}
-        columns |= {f"{place}.{name}": values for name, values in write_log.header_stamps(stamps).items()}
+        field, (z, w) = f"transforms.{number}", path.quaternion
+        fixed |= {f"{field}.header.frame_id": WORLD, f"{field}.child_frame_id": BODIES[path.name]}
+        columns |= {f"{field}.{name}": values for name, values in write_log.header_stamps(stamps).items()}
         columns |= {
-            f"{place}.transform.translation.x": path.x_m[rows],
-            f"{place}.transform.translation.y": path.y_m[rows],
-            f"{place}.transform.rotation.z": z[rows],
-            f"{place}.transform.rotation.w": w[rows],
+            f"{field}.transform.translation.x": path.x_m[rows],
+            f"{field}.transform.translation.y": path.y_m[rows],
+            f"{field}.transform.rotation.z": z[rows],
+            f"{field}.transform.rotation.w": w[rows],
         }
     return write_log.TopicPlan("/tf", "tf2_msgs/msg/TFMessage", stamps, fixed, columns)
 

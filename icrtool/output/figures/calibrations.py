@@ -146,11 +146,12 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | No
     windows = f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading"
     layout: style.Look = {"width_in": 8.2, "height_in": 4.0, "margins_in": (0.75, 0.2, 1.0, 0.95), "wspace": 0.4}
     sheet = new_sheet(answer, f"{name}: {windows}", ax, **layout)
-    place, heading, turn = sheet.subplots(1, 3)[0]
+    position_axes, heading_axes, turn_axes = sheet.subplots(1, 3)[0]
     looks = BEFORE_LOOK, AFTER_LOOK
     for axes, sizes, unit, measured in (
-        (place, off_m, " m", "the place"), (heading, [np.abs(part) for part in turns], "°", "the heading change"),
-    ):  # fmt: skip
+        (position_axes, off_m, " m", "the place"),
+        (heading_axes, [np.abs(part) for part in turns], "°", "the heading change"),
+    ):
         for size, look in zip(sizes, looks, strict=True):
             ordered = np.sort(size)
             axes.plot(ordered, 100.0 * np.arange(1, len(ordered) + 1) / max(len(ordered), 1), **look)
@@ -160,16 +161,16 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate, *, ax: Axes | No
         axes.set_title("\n".join(texts), loc="left", pad=5.0, fontsize=8.5)
         end = max(REST_SHOWN * max(float(mark[-1]) for mark in marks), 1e-3)
         axes.set(xlim=(0.0, end), ylim=(0.0, 100.0), xlabel=f"Residual of {measured} [{unit.strip()}]")
-    place.set_ylabel("Windows below [%]")
-    heading.tick_params(labelleft=False)
+    position_axes.set_ylabel("Windows below [%]")
+    heading_axes.tick_params(labelleft=False)
     turned_deg = np.degrees(residuals.turn_rad)
     groups = [windows for windows in np.array_split(np.argsort(turned_deg), TURN_GROUPS) if len(windows) >= LEAST_TURNS]
     for residual, look in zip(turns, looks, strict=True):
         middle = [[float(np.median(column[windows])) for windows in groups] for column in (turned_deg, residual)]
-        turn.plot(*middle, marker="o", markersize=3.5, **look)
-    turn.axhline(0.0, **style.HALF_WIDTH)
-    turn.set(xlabel="Heading change, clockwise [°]", ylabel="Median residual [°]")
-    turn.set_title("residual by heading change\n(a slope: wrong multiplier)", loc="left", pad=5.0, fontsize=8.5)
+        turn_axes.plot(*middle, marker="o", markersize=3.5, **look)
+    turn_axes.axhline(0.0, **style.HALF_WIDTH)
+    turn_axes.set(xlabel="Heading change, clockwise [°]", ylabel="Median residual [°]")
+    turn_axes.set_title("residual by heading change\n(a slope: wrong multiplier)", loc="left", pad=5.0, fontsize=8.5)
     sheet.legend()
     return sheet.finish()
 

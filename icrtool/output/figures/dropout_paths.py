@@ -328,13 +328,13 @@ def dropout_map(report: DropoutReport, *, ax: Axes | None = None) -> Figure | Ax
     # The largest errors lie on top.
     drawn = np.flatnonzero(np.isfinite(error_m))
     drawn = drawn[np.argsort(error_m[drawn], kind="stable")]
-    place = np.column_stack([east[rows], north[rows]])
+    points = np.column_stack([east[rows], north[rows]])
     end = min(most, MOST_OF_P95 * p95) or 1.0
     step = float(min(round_steps(end / ERROR_STEPS), key=lambda step: abs(step - end / ERROR_STEPS)))
     steps = step * np.arange(np.ceil(end / step) + 1)
     shades = ListedColormap(colormaps[ERROR_MAP](np.linspace(LIGHTEST, 1.0, len(steps) - 1)))
     lines = LineCollection(
-        np.stack([place[drawn], place[drawn + 1]], axis=1).tolist(), cmap=shades, linewidths=ERROR_LINE_PT,
+        np.stack([points[drawn], points[drawn + 1]], axis=1).tolist(), cmap=shades, linewidths=ERROR_LINE_PT,
         norm=BoundaryNorm(steps, len(steps) - 1), capstyle="round", zorder=3,
     )  # fmt: skip
     lines.set_array(error_m[drawn])

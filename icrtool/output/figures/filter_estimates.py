@@ -179,10 +179,15 @@ def _draw_estimate(
     begin, end = span_s[0] / unit, max(span_s[1] / unit, span_s[0] / unit + 1e-3)
     axes.set_xlim(begin, end)
     if last and (of_drive := run.document.icr_of_drive(column)) is not None:
-        place, reach = of_drive
-        spread += [place - reach, place + reach]
+        drive_m, drive_std_m = of_drive
+        spread += [drive_m - drive_std_m, drive_m + drive_std_m]
         axes.errorbar(
-            [end + DRIVE_BEHIND * (end - begin)], [place], [reach], clip_on=False, label="whole drive ±1σ", **DRIVE_LOOK
+            [end + DRIVE_BEHIND * (end - begin)],
+            [drive_m],
+            [drive_std_m],
+            clip_on=False,
+            label="whole drive ±1σ",
+            **DRIVE_LOOK,
         )
     axes.set_ylim(*scale_of(spread))
     axes.locator_params(axis="y", nbins=5)
@@ -228,10 +233,10 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
         axes.axvline(mean, label="mean", **style.MEAN)
         title = f"{signed_text(mean)} ± {std:.3f} m"
     if (track := run.track_width_m) is not None:
-        place = SIDES[column] * track / 2
-        if low <= place <= high:
-            axes.axvline(place, **NO_SLIP_PLACE)
-        title += f"\nno slip: {signed_text(place)} m"
+        no_slip_m = SIDES[column] * track / 2
+        if low <= no_slip_m <= high:
+            axes.axvline(no_slip_m, **NO_SLIP_PLACE)
+        title += f"\nno slip: {signed_text(no_slip_m)} m"
     axes.set_title(title, pad=4.0)
     axes.set_xlabel(f"ICR {ICR_WORDS[column]} [m]")
     axes.locator_params(axis="x", nbins=3, min_n_ticks=2)

@@ -267,9 +267,9 @@ def draw_nees(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None
 
 def draw_coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the share of the time in which the truth is within 2 sigma, by state."""
-    for place, (level, look) in enumerate(zip(levels, STUDY_LOOKS, strict=False)):
+    for series_index, (level, look) in enumerate(zip(levels, STUDY_LOOKS, strict=False)):
         held = consistency_of(level.found)["coverage_pct"]
-        _draw_points(axes, STUDY_STATES, [(share, share, share) for share in held], look, 0.15 * (place - 1))
+        _draw_points(axes, STUDY_STATES, [(share, share, share) for share in held], look, 0.15 * (series_index - 1))
     axes.axhline(95.4, color="black", **TRUTH)
 
 

@@ -197,10 +197,10 @@ def spot_look(fill: str, size: float = 5.5, marker: str = "o", color: str = "bla
 
 
 def write_near(
-    axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[float, float] = (0.0, 0.0), **look: Any
+    axes: Axes, text: str, point: tuple[float, float], offset_pt: tuple[float, float] = (0.0, 0.0), **look: Any
 ) -> None:
     """Write a text at an offset [points] from a place, without a box: a box would hide the lines below it."""
-    axes.annotate(text, place, xytext=offset_pt, textcoords="offset points", **look)
+    axes.annotate(text, point, xytext=offset_pt, textcoords="offset points", **look)
 
 
 def drawable_text(text: str, longest: int = LONGEST_MESSAGE) -> str:

@@ -191,11 +191,11 @@ def _write_times(axes: Axes, run: Run, cell_m: float, drawn: Sequence[tuple[Floa
     written, labels = list(ends), []
     for time in np.arange(every, span, every):
         row = int(np.searchsorted(table.t_s, time))
-        place = float(table.east_m[row]), float(table.north_m[row])
-        if min(math.dist(place, other) for other in written) > clear:
-            written.append(place)
+        position = float(table.east_m[row]), float(table.north_m[row])
+        if min(math.dist(position, other) for other in written) > clear:
+            written.append(position)
             text = f"{time:.0f} s" if every < 60 else f"{time / 60:.0f} min" if every < 3600 else f"{time / 3600:.0f} h"
-            labels.append(Label(text, *place))
+            labels.append(Label(text, *position))
     look: style.Look = {"marks": ends, "size_pt": TIME_PT, "farthest_pt": TIME_NEAR_PT, "color": "0.25"}
     for _, *shown, _ in write_labels(axes, labels, drawn, **look):
         axes.plot(*shown, marker="|", color="black", markersize=7.0, zorder=4.7)

@@ -150,47 +150,47 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     )  # fmt: skip
 
 
-def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
+def page_blocks(document: RunDocument, report: DropoutDocument) -> list[Block]:
     """Return the blocks of the page of a run: answer, drive, errors, motion model, limits, warnings."""
-    summary = with_verdict(summary, report)
+    document = with_verdict(document, report)
     rows = [
         (
             event.kind, duration_text(event.begin_s), duration_text(event.end_s - event.begin_s),
             distance_text(event.distance_m), f"{100 * event.severity:.0f} %",
         )
-        for event in summary.events
+        for event in document.events
     ]  # fmt: skip
     head = ("kind", "from", "lasts", "distance", "missing motion")
     caption = "Slip events: the robot did not move as its wheels did"
-    events = Table("lr", rows, head, caption, [event.begin_s for event in summary.events])
+    events = Table("lr", rows, head, caption, [event.begin_s for event in document.events])
     drive = [
-        Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive", drive_charts(position_word(summary))),
+        Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive", drive_charts(position_word(document))),
         Section("", [events], PAGE), *outage_blocks(report), Figure(("icr_clusters", "outages")),
     ]  # fmt: skip
-    warnings = [finding.text for finding in summary.notes if not is_grave(finding)]
+    warnings = [finding.text for finding in document.notes if not is_grave(finding)]
     return [
-        unusable_line(summary), *(f"What to do: {step}" for step in (next_step(summary),) if step),
-        Section("Answer", _cards(summary, report), name="answer"),
+        unusable_line(document), *(f"What to do: {step}" for step in (next_step(document),) if step),
+        Section("Answer", _cards(document, report), name="answer"),
         controller_section(report),
         Section("The drive", drive, name="drive"),
-        errors_section(report, summary), worst_section(summary, report), model_section(report),
+        errors_section(report, document), worst_section(document, report), model_section(report),
         Section("Acceptance limits", verdict_lines(report), name="limits"),
         Section("Warnings", [Items(warnings) if warnings else "None."], PAGE, name="warnings"),
     ]  # fmt: skip
 
 
-def _cards(summary: RunDocument, report: DropoutDocument) -> list[Section]:
+def _cards(document: RunDocument, report: DropoutDocument) -> list[Section]:
     """Return the answer as cards; the last card has the drive from above."""
     cards = []
-    for section in answer_sections(summary, report):
+    for section in answer_sections(document, report):
         blocks = [
             block._replace(caption="") if isinstance(block, Table) and block.caption == section.title else block
             for block in section.blocks
         ]
         # The checks of the card already state the reasons for care, except a change of ground.
         care = section.name == "trust" and section.grade == "care"
-        cards.append(section._replace(blocks=blocks, text=summary.partly_because or "" if care else section.text))
-    up = "The drive from above, north up" if summary.gnss.datum is not None else "The drive from above"
+        cards.append(section._replace(blocks=blocks, text=document.partly_because or "" if care else section.text))
+    up = "The drive from above, north up" if document.gnss.datum is not None else "The drive from above"
     marks = f"{up}; ○ start, ■ end{', red: the trial with the largest error' if report.worst else ''}."
     drawing = Figure((), "sketch", (Chart("sketch", up, marks),))
     if cards[-1].name != "worst-case":
@@ -198,18 +198,20 @@ def _cards(summary: RunDocument, report: DropoutDocument) -> list[Section]:
     return [*cards[:-1], cards[-1]._replace(blocks=[drawing])]
 
 
-def _settings(summary: RunDocument) -> list[Section]:
+def _settings(document: RunDocument) -> list[Section]:
     """Return the sections with the chosen streams, the findings about them, and the configuration of a run."""
-    stream_blocks: list[Block] = [Facts([(role_word(summary, stream.role), stream.why) for stream in summary.streams])]
+    stream_blocks: list[Block] = [
+        Facts([(role_word(document, stream.role), stream.why) for stream in document.streams])
+    ]
     alignment = []
-    for name, finding in summary.alignment.items():
+    for name, finding in document.alignment.items():
         value, applied = plus_minus(finding.value, finding.std, 4, ""), plus_minus(finding.applied or None, None, 4, "")
         alignment.append((name, value, applied, finding.why))
     caption = "Alignment of the streams: findings and corrections"
     stream_blocks.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
     return [
         Section("Reasons for these streams, and findings about them", stream_blocks, PAGE),
-        Section("Configuration that the run was made with", [Line(format_settings(summary.config), "as is")], PAGE),
+        Section("Configuration that the run was made with", [Line(format_settings(document.config), "as is")], PAGE),
     ]
 
 

@@ -78,15 +78,15 @@ def dropout_blocks(report: DropoutReport) -> list[Block]:
     return [*blocks, *baseline_sections(report), verdicts]
 
 
-def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
+def report_blocks(document: RunDocument, report: DropoutDocument) -> list[Block]:
     """Return a stored report as blocks, with the verdicts last.
 
     Parameters
     ----------
-    summary : content of run.json
+    document : content of run.json
     report : content of report.json; null for a number that is not known
     """
-    summary = with_verdict(summary, report)
+    document = with_verdict(document, report)
     # The trials of the first row are counted at the horizon with trials that is nearest to `CHOICE_HORIZON_M`.
     counts = zip(report.trials, trials_of_first(report), strict=True)
     row, count = min(
@@ -94,32 +94,32 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     )
     trials = f"{distance_text(report.run.drive.distance_m)}, {count:,} trials of {row.horizon_m:g} m"
     return [
-        unusable_line(summary),
-        Title(run_title(summary), trials),
-        Facts([("next", next_step(summary))]),
-        *answer_sections(summary, report),
+        unusable_line(document),
+        Title(run_title(document), trials),
+        Facts([("next", next_step(document))]),
+        *answer_sections(document, report),
         *outage_blocks(report),
-        errors_section(report, summary),
+        errors_section(report, document),
         model_section(report),
         Section("", verdict_lines(report)),
     ]
 
 
-def with_verdict(summary: RunDocument, report: DropoutDocument) -> RunDocument:
+def with_verdict(document: RunDocument, report: DropoutDocument) -> RunDocument:
     """Return the document of a run with the verdict of its report, whose trials may show that it must not be used."""
-    if report.usable or not summary.usable:
-        return summary
-    return replace(summary, usable=False, unusable_because=report.unusable_because)
+    if report.usable or not document.usable:
+        return document
+    return replace(document, usable=False, unusable_because=report.unusable_because)
 
 
-def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Section]:
+def answer_sections(document: RunDocument, report: DropoutDocument) -> list[Section]:
     """Return distance, trust and worst case; for a run that is not usable, a section that states this."""
     if not (report.usable or report.budgets):
         unknown = Section("How far without GNSS?", ["Not known: the run is not usable."], VERBOSE, name="reach")
-        return [unknown, trust_section(summary, report)._replace(depth=VERBOSE)]
-    cards = [reach_section(summary, report), numbers_section(summary, report), trust_section(summary, report)]
+        return [unknown, trust_section(document, report)._replace(depth=VERBOSE)]
+    cards = [reach_section(document, report), numbers_section(document, report), trust_section(document, report)]
     for trial in report.worst[:1]:
-        note = _meanwhile(trial, summary, report)
+        note = _meanwhile(trial, document, report)
         driven = f"{trial.horizon_m:g} m from {duration_text(trial.t_s)} on"
         turns_text = f"turning {turn_text(trial.heading_change_deg)} at {trial.speed_mean_mps:.2f} m/s"
         model_text = f"with {trial.model}{f'; meanwhile: {note}' if note else ''}"
@@ -165,13 +165,13 @@ def reach_row(distance: BudgetDistance, note: str = "") -> ReachRow:
     return distance.model, distance.short_text, distance.next_text, note
 
 
-def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
+def reach_section(document: RunDocument, report: DropoutDocument) -> Section:
     """Return the distances over which the robot stays within each budget, on this drive and on the next drive."""
     blocks: list[Block] = []
     lead, text = "", ""
     others_known = list(other_ground_lines(report))
     for budget_m in dict.fromkeys(reach.budget_m for reach in report.budgets):
-        rows, others = reach_rows(report, budget_m, len(summary.events))
+        rows, others = reach_rows(report, budget_m, len(document.events))
         if rows and not lead:
             lead, text = _distance_to_plan_with(report, budget_m, rows[0])
             text += "".join(f"; {line}" for line in (*others_known[:1], *heading_lines(report)))
@@ -241,20 +241,20 @@ def as_good_lines(report: DropoutDocument) -> Iterator[str]:
         yield f"{name} ({row_of(name).words}) is not shown to be worse, and needs no calibration"
 
 
-def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
+def trust_section(document: RunDocument, report: DropoutDocument) -> Section:
     """Return whether the numbers of a report can be trusted, the reasons for care, and what was checked."""
-    checks = run_checks(summary)
+    checks = run_checks(document)
     cares = [f"{check.name} {check.text}" for check in checks if check.grade == "care" and check.name != "slip events"]
-    if summary.partly_because:
-        cares.insert(0, summary.partly_because)
-    if events := summary.events:
+    if document.partly_because:
+        cares.insert(0, document.partly_because)
+    if events := document.events:
         crossed = "trials across them count" if report.without_events is None else "left out"
         cares.append(f"{counted(len(events), 'slip event')}, {crossed}")
     grade: Grade = "care" if cares else "good"
     lead, why = ("yes, with care:" if cares else "yes"), "; ".join(cares)
-    if not (summary.usable and report.passed):
-        grade, lead, why = "bad", "no:", summary.unusable_because or "an acceptance limit is not met"
-    if count := sum(not is_grave(finding) for finding in summary.notes):
+    if not (document.usable and report.passed):
+        grade, lead, why = "bad", "no:", document.unusable_because or "an acceptance limit is not met"
+    if count := sum(not is_grave(finding) for finding in document.notes):
         checks.append(Check("care", "log", f"{counted(count, 'warning')} about it"))
     section = Section("", [Checks(sorted(checks, key=lambda check: check.grade != "care"))], VERBOSE)
     return Section("May I trust it?", [section], lead=lead, text=why, label="Trust?", grade=grade, name="trust")
@@ -265,7 +265,7 @@ def verdict_lines(report: DropoutDocument) -> list[Line]:
     return [Line(verdict.verdict, "good" if verdict.passed else "bad") for verdict in report.gates]
 
 
-def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
+def worst_section(document: RunDocument, report: DropoutDocument) -> Section:
     """Return the trials with the largest errors."""
     if not report.worst:
         return Section("Worst cases", ["No trial was long enough."], VERBOSE, name="worst")
@@ -275,11 +275,11 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
             f"{rank}", duration_text(trial.t_s), error_text(trial.errors_m[trial.model]),
             error_text(trial.errors_m.get("no_slip")), turn_text(trial.heading_change_deg),
             f"{trial.speed_mean_mps:.2f} m/s", f"{trial.north_m:z.1f} m", f"{trial.east_m:z.1f} m",
-            _meanwhile(trial, summary, report),
+            _meanwhile(trial, document, report),
         )
         for rank, trial in enumerate(report.worst, start=1)
     ]  # fmt: skip
-    across, up = (word.lower() for word in direction_words(summary))
+    across, up = (word.lower() for word in direction_words(document))
     head = ("", "from", "error", "no_slip", "turn", "mean speed", up, across, "meanwhile")
     caption = (
         f"Trials of {first.horizon_m:g} m with the largest error of {first.model} that do not "
@@ -296,15 +296,17 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
     return Section("Worst cases", blocks, PAGE, name="worst")
 
 
-def _meanwhile(trial: TrialDocument, summary: RunDocument, report: DropoutDocument) -> str:
+def _meanwhile(trial: TrialDocument, document: RunDocument, report: DropoutDocument) -> str:
     """Return what happened during a trial: jumps of the position, outages, slip."""
     speed = trial.speed_mean_mps
     end_s = trial.t_s + (trial.horizon_m / speed if speed else 0.0)
     end_ns = trial.stamp_ns + round(1e9 * (end_s - trial.t_s))
-    sizes = [jump.size_m for jump in summary.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > trial.stamp_ns]
+    sizes = [
+        jump.size_m for jump in document.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > trial.stamp_ns
+    ]
     real = [out for out in report.outages if out.kind == "real"]
     lost = [out for out in real if out.begin_s < end_s and out.end_s > trial.t_s]
-    slips = [slip.kind for slip in summary.events if slip.begin_s < end_s and slip.end_s > trial.t_s]
+    slips = [slip.kind for slip in document.events if slip.begin_s < end_s and slip.end_s > trial.t_s]
     notes = [f"the position steps by {error_text(max(sizes))}"] if sizes else []
     notes += [f"outage of {duration_text(out.end_s - out.begin_s)}" for out in lost[:1]]
     notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
@@ -370,13 +372,13 @@ def parameter_table(fitted_model: FittedModel, gyro: FittedModel | None = None) 
     return Table("lrll", rows, ("term", "value ± σ", "by this drive", "meaning"))
 
 
-def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:
+def numbers_section(document: RunDocument, report: DropoutDocument) -> Section:
     """Return the numbers for a controller, and the error with these numbers alone."""
     title = "Which numbers into the controller?"
-    if report.recommended is None or summary.config.robot.track_width_m is None:
-        return Section(title, number_blocks(summary), name="factors")
+    if report.recommended is None or document.config.robot.track_width_m is None:
+        return Section(title, number_blocks(document), name="factors")
     calibration = stored_calibration(report.recommended)
-    controller, *icrs = number_blocks(summary, calibration.controller)
+    controller, *icrs = number_blocks(document, calibration.controller)
     blocks = [controller, Section("", icrs, VERBOSE)]
     if alone := controller_error_text(calibration.controller_errors):
         blocks.append(Section("", [alone], VERBOSE))

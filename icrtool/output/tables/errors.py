@@ -63,7 +63,7 @@ def trials_of_first(report: DropoutDocument) -> list[int]:
     return [row.trials for row in (report.trials if document is None else document.by_horizon)]
 
 
-def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
+def errors_section(report: DropoutDocument, document: RunDocument) -> Section:
     """Return the errors over distance: of the shown rows, then of all rows, and the data behind them."""
     horizons = shown_horizons(np.array([row.horizon_m for row in report.trials]))
     counts = [report.trials[h] for h in horizons]
@@ -73,14 +73,14 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     trials = trials_of_first(report)
     rows.append(["trials", "", *(f"{trials[h]:,}" for h in horizons)])
     head = ("distance without GNSS", "", *(f"{row.horizon_m:g} m" for row in counts))
-    sentences = [*_source_lines(report), *_count_lines(report, summary)]
+    sentences = [*_source_lines(report), *_count_lines(report, document)]
     rests = [Table("llr", list(_other_rows(report, horizons)), head), *sentences, *_learned_blocks(report, horizons)]
     for split in report.by_turning:
         starts_word = "straight" if split.straight else "turning"
         errors = ", ".join(f"{name} {error_text(error)}" for name, error in split.expected_m.items())
         rests.append(f"{starts_word} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)")
     caption = (
-        f"{FIGURES['summary'].caption} The budget is the dashed red line. Band: 95 % interval of the number itself, "
+        f"{FIGURES['document'].caption} The budget is the dashed red line. Band: 95 % interval of the number itself, "
         "of the best row by wheels, or of the row whose name is pointed at."
     )
     return Section(
@@ -149,7 +149,7 @@ def _source_lines(report: DropoutDocument) -> Iterator[str]:
         yield f"{error_words}, of which the position reference can explain up to {error_text(nearest.p95_m)}"
 
 
-def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]:
+def _count_lines(report: DropoutDocument, document: RunDocument) -> Iterator[str]:
     """Yield lines with the trials that count, the cost of slip events, and why horizons are empty."""
     smoothed = "; compared with the smoothed trajectory, which knows all of the drive"
     reference = smoothed if report.request.reference == "smoothed" else ""
@@ -157,15 +157,15 @@ def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]
     yield f"one trial from each {moving}state ({report.starts:,} states), by wheel speeds alone{reference}"
     if model_of(report, "no_slip") is None:
         yield "no_slip is left out: robot.track_width_m is not known"
-    if summary.config.robot.skid_factor is not None and model_of(report, "vendor") is None:
-        yield f"vendor is left out: {why_no_vendor(summary)}"
+    if document.config.robot.skid_factor is not None and model_of(report, "vendor") is None:
+        yield f"vendor is left out: {why_no_vendor(document)}"
     if report.starts_standing > NOTED_STANDING * report.starts:
         share = 100 * report.starts_standing / report.starts
         standing_text = "each standstill is one start" if moving else "each is a start (--starts all)"
         yield f"the robot stood at {share:.0f} % of the states: {standing_text}"
-    if summary.reference_jumps and report.request.with_jumps:
+    if document.reference_jumps and report.request.with_jumps:
         yield "trials across jumps of the reference count"
-    yield from _event_lines(report, summary)
+    yield from _event_lines(report, document)
     horizons: dict[str, list[str]] = {}
     for row in report.trials:
         if row.why_none is not None:
@@ -175,9 +175,9 @@ def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]
         yield f"no trial of {span} m: {why}"
 
 
-def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
+def _event_lines(report: DropoutDocument, document: RunDocument) -> list[str]:
     """Return the errors with and without slip events, at the longest horizon with both kinds of trials."""
-    cost, icr, events = report.without_events, model_of(report, "icr"), summary.events
+    cost, icr, events = report.without_events, model_of(report, "icr"), document.events
     if cost is None and events:
         lasted = duration_text(sum(event.end_s - event.begin_s for event in events))
         return [f"trials cross {counted(len(events), 'slip event')}, {lasted} in all; --without-events leaves them out"]

@@ -12,7 +12,7 @@ from icrtool.config import Config
 from icrtool.errors import IcrToolError
 from icrtool.logs.read_log import SurveyDocument, SurveyedTopic
 from icrtool.logs.streams.wheel_pairs import topic_of_side
-from icrtool.output.tables.run import Row, excitation_check, next_line, warnings_line
+from icrtool.output.tables.run import LabelledLine, excitation_check, next_line, warnings_line
 from icrtool.output.text_blocks import VERBOSE, Block, Facts, Section, Table
 from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
@@ -24,7 +24,7 @@ OLDEST_DATE_NS = 946_684_800_000_000_000
 """Stamp of 1 January 2000 [ns]. Earlier stamps count from the start of a computer or a simulation."""
 
 
-def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
+def overview_rows(log: RobotLog, run: Run | None) -> list[LabelledLine]:
     """Return date, duration, distance and extent of a log; the distance where it could be fitted."""
     stamps = [table.stamp_ns for table in (log.wheels, log.gnss, log.heading) if len(table.stamp_ns)]
     if not stamps:
@@ -65,7 +65,7 @@ def info_blocks(
     scorable : topics with poses that are not the reference
     """
     decision, good = verdict(run, problem, names), run is not None and run.usable
-    rows: list[Row] = []
+    rows: list[LabelledLine] = []
     if survey is not None:
         size = sum(file.bytes for file in survey.inputs)
         topics, files = counted(len(survey.topics), "topic"), counted(len(survey.inputs), "file")
@@ -93,7 +93,7 @@ def info_blocks(
     return [answer, Facts(rows), next_line(command or ""), *_survey_sections(names[1], survey, log)]
 
 
-def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Row]:
+def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[LabelledLine]:
     """Yield each topic that is used, or the candidates closest to being usable, and the number of other topics."""
     used: set[str] = set()
     if log is not None:

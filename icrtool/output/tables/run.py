@@ -71,7 +71,7 @@ AGREES_SIGMAS = 3.0
 LONGEST_TOPIC = 60
 """Largest number of characters of a stream's topics in a sentence."""
 
-Row = tuple[str, str]
+LabelledLine = tuple[str, str]
 """Label of a line, and its sentence."""
 
 
@@ -83,54 +83,54 @@ def format_run(run: Run) -> str:
     return format_blocks(run_blocks(run.document))
 
 
-def run_blocks(summary: RunDocument) -> list[Block]:
+def run_blocks(document: RunDocument) -> list[Block]:
     """Return the output of `icrtool fit` as blocks: usability, numbers, checks, and sources of the numbers."""
-    excitation = summary.excitation
+    excitation = document.excitation
     turns_text = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
-    driven = f"{distance_text(summary.drive.distance_m)}, {duration_text(summary.drive.duration_s)}"
-    verdict = "" if not summary.usable else "PARTLY" if summary.partly_because else "USABLE"
-    grounds = unstated_grounds(summary) if summary.usable else ()
-    why = "the ground changes: no single multiplier fits the whole drive" if grounds else summary.partly_because
+    driven = f"{distance_text(document.drive.distance_m)}, {duration_text(document.drive.duration_s)}"
+    verdict = "" if not document.usable else "PARTLY" if document.partly_because else "USABLE"
+    grounds = unstated_grounds(document) if document.usable else ()
+    why = "the ground changes: no single multiplier fits the whole drive" if grounds else document.partly_because
     label, blanks = f"{verdict:{LABEL + 2}}", " " * (LABEL + 2)
     lines = textwrap.wrap(
-        why or warnings_line(summary.notes), BRIEF_WIDTH, initial_indent=label, subsequent_indent=blanks
+        why or warnings_line(document.notes), BRIEF_WIDTH, initial_indent=label, subsequent_indent=blanks
     )
     roles: dict[str, list[str]] = {}
-    for stream in summary.streams:
+    for stream in document.streams:
         topics = shortened(topics_text(stream.topic), LONGEST_TOPIC)
         roles.setdefault(topics, []).append("position" if stream.role == "gnss" else stream.role)
     inputs = "; ".join(f"{topic} ({', '.join(taken)})" for topic, taken in roles.items())
     return [
-        unusable_line(summary),
-        Title(run_title(summary), f"{driven}, turned {turns_text}"),
-        Line("\n".join(lines) or verdict, "good" if summary.usable else "as is"),
+        unusable_line(document),
+        Title(run_title(document), f"{driven}, turned {turns_text}"),
+        Line("\n".join(lines) or verdict, "good" if document.usable else "as is"),
         Facts(_stretch_rows(grounds)),
-        *(number_blocks(summary) if summary.usable else ()),
-        Checks(run_checks(summary)),
-        Facts([("corrected", "; ".join(corrections(summary))), ("inputs", inputs)]),
-        streams_section(summary),
+        *(number_blocks(document) if document.usable else ()),
+        Checks(run_checks(document)),
+        Facts([("corrected", "; ".join(corrections(document))), ("inputs", inputs)]),
+        streams_section(document),
     ]
 
 
-def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
+def next_blocks(document: RunDocument, place: str, examine: str) -> list[Block]:
     """Return the place of a run, and the next step; `examine` is the command that finds the problem of its log."""
-    command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
-    if (stretches := unstated_grounds(summary)) and summary.inputs:
+    command = shlex.join(["icrtool", "dropout-report", place]) if document.usable else examine
+    if (stretches := unstated_grounds(document)) and document.inputs:
         times = [word for stretch in stretches[1:] for word in ("--terrain-change", f"{stretch.begin_s:.0f}")]
-        command = shlex.join(["icrtool", "fit", summary.inputs[0].path, *times])
-    drive = next_step(summary)
-    tested = summary.usable and not stretches
+        command = shlex.join(["icrtool", "fit", document.inputs[0].path, *times])
+    drive = next_step(document)
+    tested = document.usable and not stretches
     distance = "without GNSS: not known yet; the next command tests it" if tested else ""
     facts = Facts([("written to", place), ("distance", distance), ("next", drive)])
     return [Section("", [facts, next_line("" if drive else command)])]
 
 
-def unstated_grounds(summary: RunDocument) -> tuple[GroundStretch, ...]:
+def unstated_grounds(document: RunDocument) -> tuple[GroundStretch, ...]:
     """Return the stretches of a drive whose ground changes, as found; none where the user stated the changes."""
-    return () if summary.request.changes_s else summary.wheels.ground_stretches
+    return () if document.request.changes_s else document.wheels.ground_stretches
 
 
-def _stretch_rows(stretches: Sequence[GroundStretch]) -> list[Row]:
+def _stretch_rows(stretches: Sequence[GroundStretch]) -> list[LabelledLine]:
     """Return time and multiplier ± σ of stretches, two on a line."""
     rows = [
         f"{stretch.begin_s:.0f} to {stretch.end_s:.0f} s: {stretch.multiplier:.3f}"
@@ -145,22 +145,22 @@ def next_line(command: str) -> Line:
     return Line(f"{'next':12}{command}" if command else "", "as is")
 
 
-def next_step(summary: RunDocument) -> str:
+def next_step(document: RunDocument) -> str:
     """Return what to check or to drive next, of a run that is not usable; empty where nothing is known to help."""
-    if summary.usable:
+    if document.usable:
         return ""
-    wrong = next((finding.text for finding in summary.notes if finding.code == "wheel_scale_differs"), "")
-    return wrong.partition(": ")[2] if scale_is_wrong(summary) else to_drive(summary)
+    wrong = next((finding.text for finding in document.notes if finding.code == "wheel_scale_differs"), "")
+    return wrong.partition(": ")[2] if scale_is_wrong(document) else to_drive(document)
 
 
-def scale_is_wrong(summary: RunDocument) -> bool:
+def scale_is_wrong(document: RunDocument) -> bool:
     """Return whether a run must not be used because the wheel radius, or the unit of the wheels, is wrong."""
-    return any(finding.code == "wheel_scale_wrong" for finding in summary.notes)
+    return any(finding.code == "wheel_scale_wrong" for finding in document.notes)
 
 
-def unusable_line(summary: RunDocument) -> Line:
-    """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
-    return Line("" if summary.usable else f"Do not use: {summary.unusable_because}", "bad")
+def unusable_line(document: RunDocument) -> Line:
+    """Return why the ICRs of a run must not be used, by its document; empty where they can be."""
+    return Line("" if document.usable else f"Do not use: {document.unusable_because}", "bad")
 
 
 def warnings_line(notes: Sequence[Note]) -> str:
@@ -169,13 +169,13 @@ def warnings_line(notes: Sequence[Note]) -> str:
     return f"{counted(count, 'warning')} (-v): {first.finding}" if first is not None else ""
 
 
-def number_blocks(summary: RunDocument, controller_numbers: ControllerNumbers | None = None) -> list[Block]:
+def number_blocks(document: RunDocument, controller_numbers: ControllerNumbers | None = None) -> list[Block]:
     """Return the numbers for a controller, and the ICRs from which they are computed.
 
     `controller_numbers`: numbers to print instead of the numbers of the run.
     """
-    width_m, icrs = summary.config.robot.track_width_m, [summary.icr_of_drive(column) for column in ICR_COLUMNS]
-    numbers = controller_numbers or summary.controller
+    width_m, icrs = document.config.robot.track_width_m, [document.icr_of_drive(column) for column in ICR_COLUMNS]
+    numbers = controller_numbers or document.controller
     if width_m is not None and numbers is not None:
         return blocks_of_numbers(numbers, width_m, icrs)
     why = "no multiplier and no no-slip model: robot.track_width_m is not known (--robot, --set)"
@@ -200,7 +200,7 @@ def blocks_of_numbers(
     return [Facts(rows, "controller"), Facts([_icr_row(icrs), ("", without)])]
 
 
-def _icr_row(icrs: Sequence[tuple[float, float] | None]) -> Row:
+def _icr_row(icrs: Sequence[tuple[float, float] | None]) -> LabelledLine:
     """Return the row with the ICRs and their standard deviations; None for an ICR that is not known."""
     named_icrs = zip(ICR_WORDS.values(), icrs, strict=True)
     return "ICRs [m]", ", ".join(
@@ -208,16 +208,16 @@ def _icr_row(icrs: Sequence[tuple[float, float] | None]) -> Row:
     )
 
 
-def run_checks(summary: RunDocument) -> list[Check]:
+def run_checks(document: RunDocument) -> list[Check]:
     """Return the checks of a run, each with its finding and its details."""
-    checks = [*_filter_check(summary), excitation_check(summary)]
-    checks += [*_fix_checks(summary), *_heading_checks(summary), *_delay_checks(summary)]
-    if spans := summary.outages_ns:
+    checks = [*_filter_check(document), excitation_check(document)]
+    checks += [*_fix_checks(document), *_heading_checks(document), *_delay_checks(document)]
+    if spans := document.outages_ns:
         away = duration_text(sum(end - begin for begin, end in spans) / 1e9)
-        lost = len(summary.rtk_losses_ns)
+        lost = len(document.rtk_losses_ns)
         cause = (f"{lost} by loss of RTK",) if lost else ()
         checks.append(Check("care", "outages", f"{len(spans)}, {away} in all", cause))
-    if events := summary.events:
+    if events := document.events:
         kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(event.kind for event in events).items())
         worst = max(events, key=lambda event: (event.end_s - event.begin_s) * event.severity)
         lasted = duration_text(worst.end_s - worst.begin_s)
@@ -227,13 +227,13 @@ def run_checks(summary: RunDocument) -> list[Check]:
     return checks
 
 
-def _filter_check(summary: RunDocument) -> Iterator[Check]:
+def _filter_check(document: RunDocument) -> Iterator[Check]:
     """Yield the filter's final ICRs, and whether they agree with the drive's ICRs where both are known."""
-    final, final_std = summary.icr.final, summary.icr.final_std
+    final, final_std = document.icr.final, document.icr.final_std
     ends, apart = [], []
     for column in ICR_COLUMNS:
         word = ICR_WORDS[column]
-        final_value, final_value_std, of_drive = final[column], final_std[column], summary.icr_of_drive(column)
+        final_value, final_value_std, of_drive = final[column], final_std[column], document.icr_of_drive(column)
         if of_drive is None or final_value is None or final_value_std is None:
             continue
         value, std = of_drive
@@ -241,16 +241,16 @@ def _filter_check(summary: RunDocument) -> Iterator[Check]:
         sigmas = abs(final_value - value) / max(math.hypot(std, final_value_std), 1e-9)
         if sigmas > AGREES_SIGMAS:
             apart.append(f"{word} differs by {sigmas:.1f} σ: the end of the drive is not like the whole")
-    if ends and unstated_grounds(summary):
+    if ends and unstated_grounds(document):
         yield Check("care", "EKF", f"ends at {', '.join(ends)}: across grounds")
     elif ends:
         text = f"ends at {', '.join(ends)}: {'; '.join(apart) or 'agrees'}"
         yield Check("care" if apart else "good", "EKF", text)
 
 
-def excitation_check(summary: RunDocument) -> Check:
+def excitation_check(document: RunDocument) -> Check:
     """Return the check of the information about the ICRs; for an ICR that is not shown, what to drive."""
-    excitation, drive = summary.excitation, to_drive(summary)
+    excitation, drive = document.excitation, to_drive(document)
     spun = excitation.spun_right_deg + excitation.spun_left_deg
     turned = f"turned {excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
     more = (f"{turned}, {spun:,.0f}° of it on the spot",)
@@ -267,15 +267,15 @@ def excitation_check(summary: RunDocument) -> Check:
     return Check("care", "excitation", f"{words}{f': {lacks}' if lacks else ''}", more)
 
 
-def _fix_checks(summary: RunDocument) -> Iterator[Check]:
+def _fix_checks(document: RunDocument) -> Iterator[Check]:
     """Yield checks of the positions: number of used positions, distance of the filter from them, and jumps."""
-    gnss, word = summary.gnss, position_word(summary)
+    gnss, word = document.gnss, position_word(document)
     if count := gnss.used + gnss.rejected:
         reasons = {"gate": gnss.rejected_by_gate, **gnss.rejected_by_reason}
         why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
         more = [f"rejected: {why}"] if why else []
         if (difference := gnss.mean_difference_m) is not None and (largest := gnss.max_difference_m) is not None:
-            raised = summary.filter.process_position_mps != configured_noise(summary.config).position_mps
+            raised = document.filter.process_position_mps != configured_noise(document.config).position_mps
             close = "; follows them closely, because the position noise was raised" if raised else ""
             more.append(f"filter to {word}: mean {error_text(difference)}, max {error_text(largest)}{close}")
         for name, fixes in gnss.classes.items() if len(gnss.classes) > 1 else ():
@@ -289,13 +289,13 @@ def _fix_checks(summary: RunDocument) -> Iterator[Check]:
         good = gnss.rejected < NOTED_SHARE * count
         measured = "fixes" if word == "GNSS fixes" else "positions"
         yield Check("good" if good else "care", measured, f"{gnss.rejected:,} of {count:,} rejected", tuple(more))
-    if jumps := jump_count(summary.reference_jumps):
+    if jumps := jump_count(document.reference_jumps):
         yield Check("care", "reference", jumps)
 
 
-def _heading_checks(summary: RunDocument) -> Iterator[Check]:
+def _heading_checks(document: RunDocument) -> Iterator[Check]:
     """Yield checks of the heading: its difference from the course over ground, and its source."""
-    heading = summary.heading
+    heading = document.heading
     gate = f", {heading.rejected:,} rejected (gate)" if heading.rejected else ""
     more = [f"{heading.source.replace('_', ' ')}: {heading.parts}"] if heading.parts else []
     more.append(f"{heading.used:,} of {heading.used + heading.rejected:,} used{gate}")
@@ -310,23 +310,23 @@ def _heading_checks(summary: RunDocument) -> Iterator[Check]:
     yield Check("good", "heading", f"{value} from the course over ground{cause}", tuple(more))
 
 
-def _delay_checks(summary: RunDocument) -> Iterator[Check]:
+def _delay_checks(document: RunDocument) -> Iterator[Check]:
     """Yield a check for each stream that seems to lag or lead the wheels."""
-    if summary.filter.reference_delay_s or summary.heading.applied_delay_s:
+    if document.filter.reference_delay_s or document.heading.applied_delay_s:
         return
     checks = []
-    for word, facts in (("headings", summary.heading), ("fixes", summary.gnss)):
+    for word, facts in (("headings", document.heading), ("fixes", document.gnss)):
         delay, std = facts.delay_s, facts.delay_std_s
         if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, CORRECTION_SIGMAS * std):
             checks.append(
                 f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {plus_minus(abs(delay), std, 2, '')} s"
             )
-    multiplier = summary.icr.separation_multiplier
+    multiplier = document.icr.separation_multiplier
     slips = multiplier is None or multiplier > SLIPPING_MULTIPLIER
     cause = "slip of the wheels" if slips else f"the robot's response to its wheels, up to {LONGEST_RESPONSE_S:g} s,"
     lines = [*checks, f"not corrected: {cause} has the same effect"] if checks else []
-    speed = summary.drive.speed_mean_mps
-    if summary.gnss.delay_s is None and summary.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
+    speed = document.drive.speed_mean_mps
+    if document.gnss.delay_s is None and document.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
         shift = error_text(TYPICAL_DELAY_S * speed)
         lines.append(
             f"fixes: this drive does not show their delay; a lag of {TYPICAL_DELAY_S:g} s would move x by {shift}"
@@ -335,53 +335,53 @@ def _delay_checks(summary: RunDocument) -> Iterator[Check]:
         yield Check("fact", "delays", lines[0], tuple(lines[1:]))
 
 
-def corrections(summary: RunDocument) -> list[str]:
+def corrections(document: RunDocument) -> list[str]:
     """Return what the alignment corrected, a few words each."""
-    applied = {name: finding.applied for name, finding in summary.alignment.items()}
+    applied = {name: finding.applied for name, finding in document.alignment.items()}
     scale, left, right = (applied.get(name) or 1.0 for name in ("wheel_scale", "left_scale", "right_scale"))
     texts = [f"wheels {100 * scale:.1f} %"] if abs(scale - 1.0) > NOTED_SCALE else []
     if abs(left - right) > NOTED_SCALE:
         side, share = ("left", (right - left) / right) if left < right else ("right", (left - right) / left)
         other_side = "right" if side == "left" else "left"
         texts.append(f"{side} wheels {100 * share:.1f} % below {other_side}")
-    if abs(offset := summary.heading.applied_offset_deg) >= SMALLEST_OFFSET_DEG:
+    if abs(offset := document.heading.applied_offset_deg) >= SMALLEST_OFFSET_DEG:
         texts.append(f"heading {-offset:+z.1f}°")
-    delays = (("position", summary.filter.reference_delay_s), ("heading", summary.heading.applied_delay_s))
+    delays = (("position", document.filter.reference_delay_s), ("heading", document.heading.applied_delay_s))
     texts += [f"{word} {'lag' if delay > 0 else 'lead'} {abs(delay):.2f} s" for word, delay in delays if delay]
     return texts
 
 
-def to_drive(summary: RunDocument) -> str:
+def to_drive(document: RunDocument) -> str:
     """Return what to drive to find the ICRs that a run does not show; empty if turns would not help.
 
     Turns do not help if the wheel radius is wrong, because the filter then rejects the measurements.
     """
-    excitation = summary.excitation
-    if scale_is_wrong(summary):
+    excitation = document.excitation
+    if scale_is_wrong(document):
         return ""
     if excitation.verdict.all_shown:
         return lacking_turns(*np.radians([excitation.turned_right_deg, excitation.turned_left_deg]).tolist())
     return next((finding.text for finding in excitation.notes if finding.code == "turns_lacking"), "")
 
 
-def streams_section(summary: RunDocument) -> Section:
+def streams_section(document: RunDocument) -> Section:
     """Return the streams that were read, and the estimates of the filter."""
-    speed = f"{plus_minus(summary.drive.speed_mean_mps, summary.drive.speed_std_mps, 2, '')} m/s (mean ± std)"
+    speed = f"{plus_minus(document.drive.speed_mean_mps, document.drive.speed_std_mps, 2, '')} m/s (mean ± std)"
     streams = []
-    for stream in summary.streams:
+    for stream in document.streams:
         message_type = stream.message_type.replace("/msg/", "/")
         rate = f"{stream.rate_hz:.1f} Hz" if stream.rate_hz is not None else "unknown"
-        names = (role_word(summary, stream.role), topics_text(stream.topic), message_type)
+        names = (role_word(document, stream.role), topics_text(stream.topic), message_type)
         streams.append((*names, rate, f"{stream.count:,}", stream.clock))
     head = ("stream", "topic", "type", "rate", "samples", "clock")
-    tables = [Table("lllrrl", streams, head), *_icr_tables(summary), *_odometry_table(summary)]
+    tables = [Table("lllrrl", streams, head), *_icr_tables(document), *_odometry_table(document)]
     return Section("Streams, filter", [f"The robot drove at {speed}.", *tables], VERBOSE)
 
 
-def _odometry_table(summary: RunDocument) -> Iterator[Table]:
+def _odometry_table(document: RunDocument) -> Iterator[Table]:
     """Yield the errors of the paths by wheel speeds alone; nothing for a run of an earlier version."""
     names = {"final ICRs": "icr", "momentary ICRs": "icr_momentary", "no slip": "no_slip"}
-    errors = {words: getattr(summary.odometry, name) for words, name in names.items()}
+    errors = {words: getattr(document.odometry, name) for words, name in names.items()}
     rows = [
         (words, *(error_text(metres) for metres in (path.mean_error_m, path.max_error_m, path.end_error_m)))
         for words, path in errors.items()
@@ -391,22 +391,22 @@ def _odometry_table(summary: RunDocument) -> Iterator[Table]:
         yield Table("lrrr", rows, ("wheels alone, whole drive", "mean error", "largest", "at the end"))
 
 
-def _icr_tables(summary: RunDocument) -> Iterator[Table]:
+def _icr_tables(document: RunDocument) -> Iterator[Table]:
     """Yield the ICRs of the drive, the convergence of the filter's ICRs, and the ICRs between the terrain changes."""
-    icr, rows = summary.icr, []
+    icr, rows = document.icr, []
     for column in ICR_COLUMNS:
-        of_drive = icr_text(*(summary.icr_of_drive(column) or (None, None)))
+        of_drive = icr_text(*(document.icr_of_drive(column) or (None, None)))
         mean, std, time_s = icr.mean[column], icr.std[column], icr.convergence_s[column]
         if mean is None:
             rows.append((ICR_WORDS[column], of_drive, "", "", "", ""))
             continue
         convergence = f"{time_s:.1f} s" if time_s is not None else "none"
         final = icr_text(icr.final[column], icr.final_std[column])
-        verdict = NOT_SHOWN_WORDS.get(summary.excitation.verdict[column], "")
+        verdict = NOT_SHOWN_WORDS.get(document.excitation.verdict[column], "")
         rows.append((ICR_WORDS[column], of_drive, final, convergence, plus_minus(mean, std), verdict))
     yield Table("lrrrrl", rows, ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", ""))
     segments = []
-    for number, segment in enumerate(summary.segments, start=1):
+    for number, segment in enumerate(document.segments, start=1):
         icrs = [(segment.mean[column], segment.std[column]) for column in ICR_COLUMNS]
         texts = (icr_text(*icr) if icr[0] is not None else "no states" for icr in icrs)
         segments.append((f"  {number}", f"{segment.begin_s:.1f} s", *texts))
@@ -419,6 +419,6 @@ def _icr_tables(summary: RunDocument) -> Iterator[Table]:
             f"{stretch.end_s:.0f} s",
             plus_minus(stretch.multiplier, stretch.multiplier_std),
         )
-        for number, stretch in enumerate(summary.wheels.ground_stretches, start=1)
+        for number, stretch in enumerate(document.wheels.ground_stretches, start=1)
     ]
     yield Table("lrrr", grounds, ("ground", "begins", "ends", "multiplier ± σ by the turns"))
