@@ -76,10 +76,10 @@ class KnownDrive:
                 continue
             row += chunk.start
             start, end = trials.starts[row], trials.ends[row, column]
-            near = self._steps_around(start, end)
-            path = predicted_path(self.recording, *self._known(number, turned=turned), near)
-            for all_errors, missed in zip(errors, trial_errors(self.recording, start, end, path), strict=True):
-                all_errors[row, column] = missed
+            span_steps = self._steps_around(start, end)
+            path = predicted_path(self.recording, *self._known(number, turned=turned), span_steps)
+            for all_errors, horizon_errors in zip(errors, trial_errors(self.recording, start, end, path), strict=True):
+                all_errors[row, column] = horizon_errors
         return errors
 
     def path(self, start: int, end: int, *, turned: bool = False) -> OpenLoopPath:

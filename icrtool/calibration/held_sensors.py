@@ -105,17 +105,19 @@ def pooled_constants(
     sources = {sensors.heading_source for sensors in stored}
     if heading_source is None and len(sources) == 1:
         (heading_source,) = sources
-    of_logs = [(sensors.heading_source, sensors.gyro if with_gyro else sensors.wheels) for sensors in stored]
-    of_sources = [(source, known_constants(constants)) for source, constants in of_logs if constants is not None]
+    log_constants = [(sensors.heading_source, sensors.gyro if with_gyro else sensors.wheels) for sensors in stored]
+    source_constants = [
+        (source, known_constants(constants)) for source, constants in log_constants if constants is not None
+    ]
     pairs = []
     for column, usual_std in enumerate(BETWEEN_DRIVES_STD):
-        of_offset = column == 0
+        is_offset = column == 0
         known = np.array([
             (constants.mean[column], constants.std[column])
-            for source, constants in of_sources
-            if math.isfinite(constants.mean[column]) and not (of_offset and source != heading_source)
+            for source, constants in source_constants
+            if math.isfinite(constants.mean[column]) and not (is_offset and source != heading_source)
         ])  # fmt: skip
-        if of_offset and len(known):
+        if is_offset and len(known):
             # Angles are unwrapped about the first one.
             known[:, 0] -= 2.0 * np.pi * np.round((known[:, 0] - known[0, 0]) / (2.0 * np.pi))
         pairs.append(_further(known, usual_std) if len(known) else (math.nan, math.nan))

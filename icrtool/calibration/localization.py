@@ -97,8 +97,10 @@ def localization(calibration: Calibration, run: Run | None = None) -> Localizati
     )
     gyro_rate = None
     if errors.gyro_rate_variance is not None:
-        of_gyro = f"held-out errors of the model with the gyro over {TWIST_OVER_M:g} m, the reference's noise included"
-        gyro_rate = Estimate(errors.gyro_rate_variance, errors.gyro_rate_variance_std, of_gyro)
+        gyro_origin = (
+            f"held-out errors of the model with the gyro over {TWIST_OVER_M:g} m, the reference's noise included"
+        )
+        gyro_rate = Estimate(errors.gyro_rate_variance, errors.gyro_rate_variance_std, gyro_origin)
     left_out = [] if gyro_rate is not None else ["imu0: no gyro that turns with the robot"]
     if run is None:
         left_out += [
@@ -223,10 +225,11 @@ def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
     if heading.applied_offset_deg == 0.0:
         compared += ": too small to correct"
     declination = Estimate(0.0, None, "no declination shown: yaw_offset is the whole offset")
-    of_north = heading.magnetic_declination_deg
-    if of_north is not None and "magnetic declination" in (heading.offset_name or ""):
-        words = f"World Magnetic Model: magnetic north is {of_north:+z.1f} deg east of north; the sign is that of ENU"
-        declination = Estimate(-math.radians(of_north), math.radians(DECLINATION_STD_DEG), words)
+    declination_deg = heading.magnetic_declination_deg
+    if declination_deg is not None and "magnetic declination" in (heading.offset_name or ""):
+        north = f"magnetic north is {declination_deg:+z.1f} deg east of north"
+        words = f"World Magnetic Model: {north}; the sign is that of ENU"
+        declination = Estimate(-math.radians(declination_deg), math.radians(DECLINATION_STD_DEG), words)
         compared += ", without the declination"
     offset = math.remainder(applied - declination.value, 2.0 * math.pi)
     return declination, Estimate(offset, None if std is None else math.radians(std), compared), ""

@@ -47,8 +47,8 @@ def with_motion(run: Run) -> RunDocument:
         fits = fit_models([recording], (FIVE, RECOMMENDED))
     except DataError:
         fits = {}
-    of_filter, width = run.config.filter.rules.final_of_filter, recording.width_m
-    if of_filter:
+    uses_filter_icrs, width = run.config.filter.rules.final_of_filter, recording.width_m
+    if uses_filter_icrs:
         # The ICRs are the filter's final ICRs, and the radii are the configured radii.
         right, left, x = run.table.icrs_at(-1)
         geometry = TrackGeometry(right, left, x, (right - left) / width, 1.0, 1.0)
@@ -70,7 +70,7 @@ def with_motion(run: Run) -> RunDocument:
     largest = WEAK_SHARE * abs(geometry.y_icr_right_m - geometry.y_icr_left_m)
     shown: dict[str, float] = {}
     for name, value, std in zip(ICR_COLUMNS, geometry, np.sqrt(np.diag(covariance)).tolist(), strict=False):
-        if of_filter or (verdicts[name] != "not shown" and std <= largest):
+        if uses_filter_icrs or (verdicts[name] != "not shown" and std <= largest):
             shown |= {name: float(value), f"{name}_std": std}
     document = msgspec.structs.replace(
         run.document,
@@ -81,7 +81,7 @@ def with_motion(run: Run) -> RunDocument:
         return _with_verdict(document)
     # A common error of both y ICRs cancels in the multiplier, so the standard deviation of the multiplier decides.
     numbers = controller_numbers(geometry, covariance, robot)
-    if of_filter or numbers.multiplier_std <= WEAK_SHARE * abs(numbers.multiplier):
+    if uses_filter_icrs or numbers.multiplier_std <= WEAK_SHARE * abs(numbers.multiplier):
         document = msgspec.structs.replace(document, controller=numbers)
     return _with_verdict(document, f" (σ {numbers.multiplier_std:.2f})")
 
@@ -292,8 +292,8 @@ def _rows(run: Run, held_out: HeldOut, turn_sensor: str, past: Recording) -> Ite
         for model in models_of(run):
             # With a measured turn rate, rows for comparison would be equal: their ICRs have the middle at the origin.
             if not row_of(model.name).compared:
-                of_past = model.name == "icr"
-                lines = partial(past_gyro_lines, past.track) if of_past else partial(pooled.gyro_line, recording)
+                is_past = model.name == "icr"
+                lines = partial(past_gyro_lines, past.track) if is_past else partial(pooled.gyro_line, recording)
                 errors_of = partial(_errors_turned, run, recording, model.icrs, lines)
                 yield ComparedRow(f"{model.name}_{turn_sensor}", errors_of, knows=model.knows)
 

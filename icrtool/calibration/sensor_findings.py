@@ -185,16 +185,16 @@ def _derive(
     direct : the parameters that positions show directly
     x_icr_m : known forward position of the ICRs [m]; None: not known
     """
-    of_antenna_and_icrs = [direct[key] for key in (ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION)]
-    (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, of_antenna_and_icrs)
-    of_ahead, of_aside, of_separation = (parameter.verdict for parameter in of_antenna_and_icrs)
+    measured = [direct[key] for key in (ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION)]
+    (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, measured)
+    ahead_verdict, aside_verdict, separation_verdict = (parameter.verdict for parameter in measured)
     forward, right = known_antenna_m(run)
     if forward is not None:
         antenna_forward = _parameter(forward, 0.0, "given")
-        x = _parameter(forward - ahead, ahead_std, of_ahead, "with the antenna as given")
+        x = _parameter(forward - ahead, ahead_std, ahead_verdict, "with the antenna as given")
     elif x_icr_m is not None:
         note = f"with x ICR at {x_icr_m:+z.3f} m, as given"
-        antenna_forward = _parameter(ahead + x_icr_m, ahead_std, of_ahead, note)
+        antenna_forward = _parameter(ahead + x_icr_m, ahead_std, ahead_verdict, note)
         x = _parameter(x_icr_m, 0.0, "given")
     else:
         fix = "positions show only antenna forward − x ICR: give frames.antenna_forward_m, or --x-icr"
@@ -203,11 +203,11 @@ def _derive(
         antenna_right = _parameter(right, 0.0, "given")
         middle, note = right - aside, "with the antenna as given"
         stds = [_numbers(run.document.alignment[name])[1] for name in ("y_icr_right_m", "y_icr_left_m")]
-        verdict = max((of_separation, of_aside), key=("given", "shown", "weak", "not shown").index)
+        verdict = max((separation_verdict, aside_verdict), key=("given", "shown", "weak", "not shown").index)
     else:
         middle, note = 0.0, "if the ICRs are symmetric about the middle of the body"
-        antenna_right = _parameter(aside, aside_std, of_aside, note)
-        stds, verdict = [separation_std / 2] * 2, of_separation
+        antenna_right = _parameter(aside, aside_std, aside_verdict, note)
+        stds, verdict = [separation_std / 2] * 2, separation_verdict
     half = separation / 2
     return {
         "antenna_forward_m": antenna_forward,

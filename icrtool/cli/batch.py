@@ -125,9 +125,9 @@ def batch_command(
     if calibrations:
         printer.text(f"\n{fleet_files.calibrations_text(calibrations)}".rstrip())
     options.check_compared(verdict for row in rows for verdict in row.verdicts)
-    missed = any(row.gates_failed for row in rows)
-    if missed or any(row.status == "failed" for row in rows):
-        raise SystemExit(3 if missed else 1)
+    limit_not_met = any(row.gates_failed for row in rows)
+    if limit_not_met or any(row.status == "failed" for row in rows):
+        raise SystemExit(3 if limit_not_met else 1)
 
 
 def run_all(

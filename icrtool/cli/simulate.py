@@ -170,12 +170,12 @@ def drive_options(*further: Option, **defaults: object) -> Option:
     """
     text = "New true ICRs [m] from T seconds on; repeatable."
     change = option("--change changes", "T:YR,YL,X", change_text, text, multiple=True)
-    of_drive = [option(*row, default=defaults.get(row[0].split()[-1])) for row in DRIVE]
-    of_robot = options_as_record("contacts", "icrtool.simulation.friction:FrictionRobot", *DYNAMICS, change=True)
-    options_of_sensors = (*of_drive, change, of_robot, *further)
-    of_sensors = options_as_record("sensors", "icrtool.simulation.drives:Sensors", *options_of_sensors, change=True)
-    of_plan = options_as_record("plan", "icrtool.simulation.drives:DrivePlan", of_sensors, change=True)
-    return options_as_record("path", "icrtool.simulation.drives:PathPlan", of_plan, change=True)
+    drive = [option(*row, default=defaults.get(row[0].split()[-1])) for row in DRIVE]
+    robot = options_as_record("contacts", "icrtool.simulation.friction:FrictionRobot", *DYNAMICS, change=True)
+    options_of_sensors = (*drive, change, robot, *further)
+    sensors = options_as_record("sensors", "icrtool.simulation.drives:Sensors", *options_of_sensors, change=True)
+    plan = options_as_record("plan", "icrtool.simulation.drives:DrivePlan", sensors, change=True)
+    return options_as_record("path", "icrtool.simulation.drives:PathPlan", plan, change=True)
 
 
 @options.command("simulate")

@@ -53,8 +53,8 @@ def why_unusable(document: RunDocument, errors: OpenLoopErrors, held_out: Iterab
         few = f"{names[least]} has only {trials[least, h]:,} trials of {horizon}"
         if errors.counts.trials[h] < FEWEST_TRIALS:
             return note("few_trials", f"{few}: the drive is too short; drive further")
-        of_icr = f"and icr has {errors.counts.trials[h]:,}"
-        return note("few_trials", f"{few}, {of_icr}; check the stamps of the wheels (icrtool info -v)")
+        icr_text = f"and icr has {errors.counts.trials[h]:,}"
+        return note("few_trials", f"{few}, {icr_text}; check the stamps of the wheels (icrtool info -v)")
     hidden = [ICR_WORDS[column] for column in ICR_COLUMNS[:2] if document.icr_of_drive(column) is None]
     icr, recommended = (rows[name][h].p95_m if name in rows else None for name in (FALLBACK_ROW, MAIN_ROW))
     if not hidden or icr is None or recommended is None:

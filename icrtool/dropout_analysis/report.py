@@ -291,9 +291,9 @@ class BaselineReport:
             return math.nan
         count = len(logarithms)
         measured = float(logarithms.var(ddof=1)) if count > 1 else 0.0
-        of_drives, freedom = pooled_variance(measured, count - 1.0, row_of(model).spread.between ** 2)
+        drive_variance, freedom = pooled_variance(measured, count - 1.0, row_of(model).spread.between ** 2)
         before = factor * math.exp(float(logarithms.mean()))
-        between = student_factor(freedom) * math.sqrt(of_drives * (1.0 + 1.0 / count)) * before
+        between = student_factor(freedom) * math.sqrt(drive_variance * (1.0 + 1.0 / count)) * before
         path_half = student_factor(len(now.trials) - 1.0) * math.sqrt(variance_of_sum(now.influence(metric)))
         return math.hypot(between, path_half)
 

@@ -127,9 +127,9 @@ def worst_trials(
     further : further rows whose paths are shown
     errors : result of `errors_by_start`; default: it is computed
     """
-    of_starts = errors_by_start(run, compared, horizon_m, starts=starts) if errors is None else errors
-    track, models, ends = _track(run, compared), models_of(run), of_starts.end
-    untaken = np.nan_to_num(of_starts.error_m, nan=-1.0)
+    start_errors = errors_by_start(run, compared, horizon_m, starts=starts) if errors is None else errors
+    track, models, ends = _track(run, compared), models_of(run), start_errors.end
+    untaken = np.nan_to_num(start_errors.error_m, nan=-1.0)
     chosen: list[int] = []
     while len(chosen) < count and untaken[worst := int(np.argmax(untaken))] >= 0.0:
         chosen.append(worst)
@@ -137,7 +137,7 @@ def worst_trials(
         untaken[before_its_end][ends[before_its_end] >= worst] = -1.0
     rows = (*(compared.rows if compared is not None else ()), *further)
     return tuple(
-        _example(run, track, models, rows, of_starts.name, start, int(ends[start]), of_starts.horizon_m)
+        _example(run, track, models, rows, start_errors.name, start, int(ends[start]), start_errors.horizon_m)
         for start in chosen
     )
 

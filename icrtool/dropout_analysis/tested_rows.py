@@ -63,8 +63,8 @@ def tested_rows(
 ) -> TestedRows:
     """Return the rows of calibrations, of scored topics and of this log's own models."""
     watch("calibrations")
-    used, of_calibrations, notes = _calibration_rows(compared, filtered, calibrations, request)
-    of_topics, topic_notes = topic_rows(compared, track_of(compared), scored) if scored else ([], [])
+    used, calibration_rows, notes = _calibration_rows(compared, filtered, calibrations, request)
+    scored_rows, topic_notes = topic_rows(compared, track_of(compared), scored) if scored else ([], [])
     compared_models, left_out = None, ""
     if request.ladder:
         watch("comparing models")
@@ -74,7 +74,7 @@ def tested_rows(
             )
         except DataError as err:
             left_out = f"{err.why}, {err.advice}"
-    return TestedRows(of_calibrations, of_topics, used, (*notes, *topic_notes), compared_models, left_out)
+    return TestedRows(calibration_rows, scored_rows, used, (*notes, *topic_notes), compared_models, left_out)
 
 
 def _calibration_rows(
@@ -97,8 +97,8 @@ def _calibration_rows(
                 stem = f"{stem}-{number}"
             name = f"calibration:{stem}"
         created = calibration.created or ""
-        of_sensors = dict.fromkeys(CalibrationFile.__struct_fields__[1:], UNSET)
-        short_record = msgspec.structs.replace(calibration, models={}, held_out=(), name=UNSET, **of_sensors)
+        without_sensors = dict.fromkeys(CalibrationFile.__struct_fields__[1:], UNSET)
+        short_record = msgspec.structs.replace(calibration, models={}, held_out=(), name=UNSET, **without_sensors)
         fitted_to_this = calibration.fitted_to(recording.sha256)
         fitted = "fitted to this log" if fitted_to_this else "not fitted to this log"
         refitted = "; sensors refitted" if request.refit_sensors else ""

@@ -201,7 +201,7 @@ def _without_lost_headings(data: FilterInputs, config: Config, antenna_m: tuple[
     if not config.filter.rules.corrects or len(data.wheel_t) < 2 or not len(data.heading_t):
         return data
     gaps = np.flatnonzero(np.diff(data.wheel_t) > wheel_gap_s(config, data.wheel_t))
-    lost, of_fixes = np.zeros(len(data.wheel_t), np.bool_), np.zeros(len(data.gnss_t), np.bool_)
+    lost, lost_fixes = np.zeros(len(data.wheel_t), np.bool_), np.zeros(len(data.gnss_t), np.bool_)
     for row in gaps.tolist():
         end = data.wheel_t[row + 1]
         after = int(np.searchsorted(data.heading_t, end))
@@ -211,12 +211,12 @@ def _without_lost_headings(data: FilterInputs, config: Config, antenna_m: tuple[
         until = data.heading_t[after]
         # A sample holds until the next one, so the heading is unknown in all samples of the span.
         lost[row + 1 : np.searchsorted(data.wheel_t, until)] = True
-        of_fixes |= (data.gnss_t > seen) & (data.gnss_t <= until)
-    if not (lost.any() or of_fixes.any()):
+        lost_fixes |= (data.gnss_t > seen) & (data.gnss_t <= until)
+    if not (lost.any() or lost_fixes.any()):
         return data
     variance = data.gnss_r
     if any(antenna_m):
-        variance = np.where(of_fixes[:, None], np.maximum(variance, LOST_FIX_VARIANCE_M2), variance)
+        variance = np.where(lost_fixes[:, None], np.maximum(variance, LOST_FIX_VARIANCE_M2), variance)
     return data._replace(slipping=data.slipping | lost if len(data.slipping) else lost, gnss_r=variance)
 
 

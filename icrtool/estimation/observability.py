@@ -114,9 +114,9 @@ def cut_states(
 
     path = path_at(track, twists, parameters, track.t[rows])
     windows = Windows(track, rows[:-1], rows[1:], np.diff(distance))
-    missed, jacobian = window_residuals(path, start, end, windows.moved, 0.0, np.ones(len(start)))
-    turned = np.diff(path.heading)
-    by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
+    moved_residuals, jacobian = window_residuals(path, start, end, windows.moved, 0.0, np.ones(len(start)))
+    turn_rad = np.diff(path.heading)
+    by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turn_rad))])
     by_terms = np.concatenate([jacobian[:, :terms], np.diff(path.heading_by).T]) @ by_icrs
     place_std_m = float(np.median(np.hypot(table.std_north_m, table.std_east_m), overwrite_input=True))
     return StateWindows(
@@ -124,9 +124,9 @@ def cut_states(
         windows.begin,
         windows.end,
         windows.length_m,
-        residuals=np.concatenate([missed, turned - windows.turned]),
+        residuals=np.concatenate([moved_residuals, turn_rad - windows.turned]),
         jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
-        turned_rad=turned,
+        turned_rad=turn_rad,
         end_m=distance[1:],
         stretch=(distance[:-1] // (STRETCH_IN_WINDOWS * window_m)).astype(np.int64),
         distance_m=whole_m,
@@ -202,8 +202,8 @@ def final_covariance(
     slip = (
         1.0 if track_width_m is None else min(max(abs(width_m / track_width_m - 1.0) / USUAL_EXCESS, LEAST_SLIP), 1.0)
     )
-    of_stretch = slip * width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
-    return sandwich_covariance(at_final_icrs, np.tile(windows.stretch[is_recent], 3), of_stretch)[:3, :3]
+    stretch_std_m = slip * width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
+    return sandwich_covariance(at_final_icrs, np.tile(windows.stretch[is_recent], 3), stretch_std_m)[:3, :3]
 
 
 def multiplier_std(covariance: Floats, track_width_m: float) -> float:

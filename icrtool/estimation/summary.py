@@ -141,10 +141,10 @@ def summarise(
 
 def _rejected_shares(filtered: Filtered) -> dict[str, float]:
     """Return the shares of fixes and of headings that were rejected while the wheels turned."""
-    of_fixes, of_headings = filtered.sensors.moving()
+    moving_fixes, moving_headings = filtered.sensors.moving()
     return {
-        "fixes": rejected_share(filtered.gnss.code[of_fixes]),
-        "headings": rejected_share(filtered.heading.code[of_headings]),
+        "fixes": rejected_share(filtered.gnss.code[moving_fixes]),
+        "headings": rejected_share(filtered.heading.code[moving_headings]),
     }
 
 
@@ -155,14 +155,14 @@ def _unusable_reasons(
 ) -> list[Note]:  # fmt: skip
     """Return why the ICRs must not be used; empty if they can be used. `summarise` computes the arguments."""
     corrects, wheels = config.filter.rules.corrects, measurements.wheels
-    of_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
+    widths_from_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
     one_ground = not changes_s and wheels.ground_change_s is None
     contradiction = ""
     if corrects and one_ground:
         contradiction = contradicts_windows(filtered.table, covariance, measurements.findings)
     return unusable_reasons(
         excitation, rejected, filtered.noise, measurements.findings["wheel_scale"] if corrects else None,
-        multiplier if of_twist else None, contradiction, wheels.filtered or "" if corrects else "", wheels,
+        multiplier if widths_from_twist else None, contradiction, wheels.filtered or "" if corrects else "", wheels,
         inverted=inverted,
     )  # fmt: skip
 

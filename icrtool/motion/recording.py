@@ -493,14 +493,14 @@ def past_lines(track: Track, turned_at: Callable[[Ints], Floats], before_std: tu
         until = int(np.searchsorted(every[1:], row, side="right"))
         for turn, time, truth in zip(*(column[done:until] for column in steps), strict=True):
             spread = MEAN_TO_STD * sizes / count
-            missed = truth - turn - scale * turn - bias * time
+            residual = truth - turn - scale * turn - bias * time
             std = math.hypot(spread, MISSED_TURN_SHARE * turn)
-            weight = 1.0 / (std**2 * math.sqrt(1.0 + (missed / (LOSS_SIGMAS * std)) ** 2))
+            weight = 1.0 / (std**2 * math.sqrt(1.0 + (residual / (LOSS_SIGMAS * std)) ** 2))
             a, b, c = a + weight * turn * turn, b + weight * turn * time, c + weight * time * time
             p, q = p + weight * turn * (truth - turn), q + weight * time * (truth - turn)
             determinant = a * c - b * b
             scale, bias = (c * p - b * q) / determinant, (a * q - b * p) / determinant
-            count, sizes = count + 1, sizes + min(abs(missed) / std, MOST_SIGMAS) * spread
+            count, sizes = count + 1, sizes + min(abs(residual) / std, MOST_SIGMAS) * spread
         done = until
         lines.append((1.0 + scale, bias))
     columns = np.array(lines)

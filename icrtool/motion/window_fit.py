@@ -179,19 +179,19 @@ def _step_columns(
     """
     if wheels is not None:
         motion = motion._replace(turn=wheels.twist(motion)[OMEGA])
-    of_model, axes, of_terms = model_columns(model, motion)
+    fixed_twist, axes, term_columns = model_columns(model, motion)
     if not model.uses_gyro:
-        return lambda parameters, _: StepColumns(of_model, axes, of_terms, parameters)
+        return lambda parameters, _: StepColumns(fixed_twist, axes, term_columns, parameters)
     k, gyro_change = len(axes), steps.gyro_change()
     # The bias and the time of the gyro are two further columns of the turn rate.
     axes = np.append(axes, [OMEGA, OMEGA])
-    of_terms = np.concatenate([of_terms, np.ones((2, len(steps.t)))])
+    term_columns = np.concatenate([term_columns, np.ones((2, len(steps.t)))])
     # These are the derivatives of the weight of the gyro in the turn rate by each parameter.
     gains = np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
 
     def columns_at(parameters: Floats, constants: Floats) -> StepColumns:
         bias, later = constants[CONSTANTS_OF_WHEELS:].tolist()
-        shift, fixed, columns = later * gyro_change, of_model.copy(), of_terms.copy()
+        shift, fixed, columns = later * gyro_change, fixed_twist.copy(), term_columns.copy()
         fixed[OMEGA] += shift
         columns[:k] += gains[:, None] * shift
         columns[-1] = (1.0 + parameters @ gains) * gyro_change
@@ -297,7 +297,7 @@ class PooledFit(FittedModel):
         if wide_prediction is not None:
             model = replace(self.model, stds=()).with_shown_priors(wide_prediction[0])
         if fold.whole:
-            gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
+            gradient, curvature = (derivatives[i] for derivatives in self._by_recording)
             # The priors may be different without the recording.
             pull = model.prior_std**-2.0 - self.model.prior_std**-2.0
             gradient, curvature = gradient - pull * (self.parameters - model.prior_mean), curvature - np.diag(pull)
@@ -526,7 +526,7 @@ class Pool:
         if wide_model is not None:
             wide = self.fit(wide_model, wheels)
             model = model.with_shown_priors(wide)
-        of_recordings = [
+        residual_functions = [
             residuals_of(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)
         ]
         k, constant_count, count = len(model.terms), len(constant_std(model)), len(self.windows)
@@ -535,7 +535,7 @@ class Pool:
         def evaluate(x: Floats) -> tuple[Floats, Floats]:
             residuals, jacobian = np.empty(len(self.group)), np.empty((len(self.group), k + constant_count))
             for i, constants in enumerate(x[k:].reshape(count, constant_count)):
-                residuals[self.rows(i)], jacobian[self.rows(i)] = of_recordings[i](x[:k], constants)
+                residuals[self.rows(i)], jacobian[self.rows(i)] = residual_functions[i](x[:k], constants)
             return residuals, jacobian
 
         solution = robust_least_squares(

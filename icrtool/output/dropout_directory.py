@@ -79,7 +79,7 @@ def write_report(
     OutputError
         A file or directory that is not from a dropout report is in the place of the report, or writing fails.
     """
-    of_run, name = path_of(directory).parent, path_of(directory).name
+    run_folder, name = path_of(directory).parent, path_of(directory).name
     with atomic_directory(directory, REPORT) as partial:
         with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
             report = analyse(sink)
@@ -87,10 +87,10 @@ def write_report(
             figure_catalogue.draw_figures("report", report, partial / "plots", plots, figures, watch)
         write_tables(report, partial)
         names = [path.relative_to(partial).as_posix() for path in sorted(partial.rglob("*")) if path.is_file()]
-        if in_run := is_run_directory(of_run):
-            relist_files(of_run, name)
+        if in_run := is_run_directory(run_folder):
+            relist_files(run_folder, name)
     if in_run:
-        relist_files(of_run, name, names)
+        relist_files(run_folder, name, names)
     return report
 
 

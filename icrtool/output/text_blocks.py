@@ -284,8 +284,8 @@ def _labelled(block: Facts | Checks, verbose: bool) -> Iterator[tuple[str, str, 
     if isinstance(block, Facts):
         widest = max((len(name) for name, _ in block.rows), default=0)
         for number, (name, text) in enumerate(block.rows):
-            of_all = f"{'' if number else block.label:{LABEL + 2}}{name:{widest}}  "
-            yield of_all if block.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
+            label = f"{'' if number else block.label:{LABEL + 2}}{name:{widest}}  "
+            yield label if block.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
         return
     for number, row in enumerate(row for row in block.rows if verbose or row.grade != "fact"):
         first = f"{'' if number else 'checks':{LABEL + 2}}{GRADE_MARKS[row.grade]:4}{row.name:{LABEL + 3}}"

@@ -80,8 +80,8 @@ def _summary_blocks(report: DropoutReport) -> list[Block]:
 
 def limit_section(verdicts: Sequence[FleetVerdict]) -> Section:
     """Return the verdicts under their common result, limits that are not met first; empty without verdicts."""
-    missed = sum(not verdict.passed for verdict in verdicts)
-    title = f"Acceptance limits not met: {missed}" if missed else "All acceptance limits are met"
+    not_met = sum(not verdict.passed for verdict in verdicts)
+    title = f"Acceptance limits not met: {not_met}" if not_met else "All acceptance limits are met"
     return Section(title, [Items([verdict.line for verdict in sorted(verdicts, key=lambda verdict: verdict.passed)])])
 
 

@@ -213,13 +213,13 @@ def _fixes(run: Run, rows: Ints, globe: Globe) -> Iterator[write_log.TopicPlan]:
     """Yield the filter's position, the fixes that it used and those that it rejected, as NavSatFix."""
     table, fixes = run.table, run.sensors.fixes
     variances = table.std_east_m**2, table.std_north_m**2
-    of_filter = table.stamp_ns, table.east_m, table.north_m, *variances, np.full(len(table), PLAIN_FIX, np.int8)
+    filter_values = table.stamp_ns, table.east_m, table.north_m, *variances, np.full(len(table), PLAIN_FIX, np.int8)
     status = np.where(fixes.fix_class == FIXED_FIX, GBAS_FIX, PLAIN_FIX).astype(np.int8)
-    measured = fixes.stamp_ns, fixes.east_m, fixes.north_m, fixes.var_east_m2, fixes.var_north_m2, status
+    fix_values = fixes.stamp_ns, fixes.east_m, fixes.north_m, fixes.var_east_m2, fixes.var_north_m2, status
     topics: list[tuple[str, str, tuple[NDArray[Any], ...], Ints]] = [
-        ("/filter/fix", BODIES["filter"], of_filter, rows),
-        ("/gnss/fix", "antenna", measured, np.flatnonzero(run.gnss.used)),
-        ("/gnss/fix_rejected", "antenna", measured, np.flatnonzero(run.gnss.rejected)),
+        ("/filter/fix", BODIES["filter"], filter_values, rows),
+        ("/gnss/fix", "antenna", fix_values, np.flatnonzero(run.gnss.used)),
+        ("/gnss/fix_rejected", "antenna", fix_values, np.flatnonzero(run.gnss.rejected)),
     ]
     for topic, frame, values, chosen in topics:
         stamp_ns, east, north, var_east, var_north, status = (column[chosen] for column in values)

@@ -180,8 +180,8 @@ class Sheet:
                 if isinstance(artist, Collection) and artist.get_array() is not None:
                     # The colours of a scale stay.
                     continue
-                of_line = ("color", "markerfacecolor", "markeredgecolor")
-                names = of_line if isinstance(artist, Line2D) else ("facecolor", "edgecolor")
+                line_colors = ("color", "markerfacecolor", "markeredgecolor")
+                names = line_colors if isinstance(artist, Line2D) else ("facecolor", "edgecolor")
                 properties = {name: getattr(artist, f"get_{name}")() for name in names}
                 artist.set(**{name: adapted(color) for name, color in properties.items() if len(to_rgba_array(color))})
             for text in panel.texts:

@@ -91,8 +91,8 @@ def study_figure(result: StudyResult, *, ax: Axes | None = None) -> Figure | Axe
     """Return the picture of a study; `ax`: axes to draw into, which are returned."""
     rows = STUDY_PICTURES[result.request.name]
     names = dict.fromkeys(level.setting.series for level in result.levels)
-    of_series = [[level for level in result.levels if level.setting.series == name] for name in names]
-    columns = [list(result.levels)] if result.request.name in TOGETHER else of_series
+    levels_by_series = [[level for level in result.levels if level.setting.series == name] for name in names]
+    columns = [list(result.levels)] if result.request.name in TOGETHER else levels_by_series
     title, subtitle, height_in = study_title(result), study_subtitle(result), 1.7 + PANEL_IN * len(rows)
     margins_in = (0.85, 0.2, 0.75, 1.2)
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=margins_in, wspace=0.12, hspace=0.5)

@@ -423,7 +423,7 @@ def change_of(pair: documents.ComparedPair, comparison: documents.GroupCompariso
     seen in one of two comparisons, a change of `SEEN_HALF_WIDTHS` half widths in four of five (power of a normal test).
     """
     drives = sum(len(comparison.groups[name].logs) for name in (pair.first, pair.second))
-    of_drives = f"with these {counted(drives, 'drive')}"
+    drives_text = f"with these {counted(drives, 'drive')}"
     measured = (error for error in pair.errors if None not in (error.p95_m, error.p95_low_m, error.p95_high_m))
     row = min(measured, key=lambda error: abs(error.horizon_m - CHOICE_HORIZON_M), default=None)
     names = f"{pair.second} against {pair.first}"
@@ -431,12 +431,12 @@ def change_of(pair: documents.ComparedPair, comparison: documents.GroupCompariso
         why = "the drives are too short for an interval of the difference"
         return Change(f"{names}: not known: {why}", "", None)
     visible_m = SEEN_HALF_WIDTHS * (row.p95_high_m - row.p95_low_m) / 2.0
-    place = f"(95 % at {row.horizon_m:g} m)"
-    power = f"{of_drives} a change below {error_text(visible_m)} {place} would not have been seen"
+    horizon_text = f"(95 % at {row.horizon_m:g} m)"
+    power = f"{drives_text} a change below {error_text(visible_m)} {horizon_text} would not have been seen"
     if row.p95_low_m <= 0.0 <= row.p95_high_m:
         return Change(f"{names}: no difference of the error found", power, differs=False)
     word = "larger" if row.p95_m > 0.0 else "smaller"
-    size = f"{with_interval(row.p95_m, row.p95_low_m, row.p95_high_m)} {place}"
+    size = f"{with_interval(row.p95_m, row.p95_low_m, row.p95_high_m)} {horizon_text}"
     return Change(f"{names}: the error is {word}: {size}", power, differs=True)
 
 

@@ -216,8 +216,8 @@ def other_ground_lines(report: DropoutDocument) -> Iterator[str]:
         wheels = [reach for reach in distances if not turned_by(reach.model)]
         if wheels:
             best = max(wheels, key=lambda reach: math.inf if reach.other_low_m is None else reach.other_low_m or 0.0)
-            of_budget = f"{best.other_text} within {budget_m:g} m (9 of 10) with {best.model}"
-            yield f"on another ground: {of_budget}; from {counted(len(grounds), 'ground')}, each left out once"
+            reach_text = f"{best.other_text} within {budget_m:g} m (9 of 10) with {best.model}"
+            yield f"on another ground: {reach_text}; from {counted(len(grounds), 'ground')}, each left out once"
 
 
 def heading_lines(report: DropoutDocument) -> Iterator[str]:

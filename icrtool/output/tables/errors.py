@@ -80,7 +80,7 @@ def errors_section(report: DropoutDocument, document: RunDocument) -> Section:
         errors = ", ".join(f"{name} {error_text(error)}" for name, error in split.expected_m.items())
         rests.append(f"{starts_word} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)")
     caption = (
-        f"{FIGURES['document'].caption} The budget is the dashed red line. Band: 95 % interval of the number itself, "
+        f"{FIGURES['summary'].caption} The budget is the dashed red line. Band: 95 % interval of the number itself, "
         "of the best row by wheels, or of the row whose name is pointed at."
     )
     return Section(

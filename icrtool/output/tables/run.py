@@ -233,10 +233,10 @@ def _filter_check(document: RunDocument) -> Iterator[Check]:
     ends, apart = [], []
     for column in ICR_COLUMNS:
         word = ICR_WORDS[column]
-        final_value, final_value_std, of_drive = final[column], final_std[column], document.icr_of_drive(column)
-        if of_drive is None or final_value is None or final_value_std is None:
+        final_value, final_value_std, drive_icr = final[column], final_std[column], document.icr_of_drive(column)
+        if drive_icr is None or final_value is None or final_value_std is None:
             continue
-        value, std = of_drive
+        value, std = drive_icr
         ends.append(f"{word.removeprefix('y ')} {final_value:+z.3f}")
         sigmas = abs(final_value - value) / max(math.hypot(std, final_value_std), 1e-9)
         if sigmas > AGREES_SIGMAS:
@@ -395,15 +395,15 @@ def _icr_tables(document: RunDocument) -> Iterator[Table]:
     """Yield the ICRs of the drive, the convergence of the filter's ICRs, and the ICRs between the terrain changes."""
     icr, rows = document.icr, []
     for column in ICR_COLUMNS:
-        of_drive = icr_text(*(document.icr_of_drive(column) or (None, None)))
+        drive_text = icr_text(*(document.icr_of_drive(column) or (None, None)))
         mean, std, time_s = icr.mean[column], icr.std[column], icr.convergence_s[column]
         if mean is None:
-            rows.append((ICR_WORDS[column], of_drive, "", "", "", ""))
+            rows.append((ICR_WORDS[column], drive_text, "", "", "", ""))
             continue
         convergence = f"{time_s:.1f} s" if time_s is not None else "none"
         final = icr_text(icr.final[column], icr.final_std[column])
         verdict = NOT_SHOWN_WORDS.get(document.excitation.verdict[column], "")
-        rows.append((ICR_WORDS[column], of_drive, final, convergence, plus_minus(mean, std), verdict))
+        rows.append((ICR_WORDS[column], drive_text, final, convergence, plus_minus(mean, std), verdict))
     yield Table("lrrrrl", rows, ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", ""))
     segments = []
     for number, segment in enumerate(document.segments, start=1):
