@@ -106,14 +106,14 @@ def calibrated_drive(
     return CalibratedDrive(KnownDrive(recording, learned), sensors, knows, tuple(notes))
 
 
-def _knows(held: Sequence[str], unknown: Sequence[str]) -> str:
-    """Return the sources of constants in words; `held` and `unknown` are names of `SensorConstants`."""
+def _knows(known: Sequence[str], unknown: Sequence[str]) -> str:
+    """Return the sources of constants in words; `known` and `unknown` are names of `SensorConstants`."""
     parts = []
-    if shown := [name for name in held if name != LEARNED]:
+    if shown := [name for name in known if name != LEARNED]:
         parts.append(f"{words_of(shown)} held")
     if fitted := [name for name in unknown if name != LEARNED]:
         parts.append(f"{words_of(fitted)} from this drive, as the calibration has none")
-    if LEARNED in (*held, *unknown):
+    if LEARNED in (*known, *unknown):
         parts.append(f"{words_of([LEARNED])} from {PAST}")
     return ", ".join(parts)
 

@@ -169,8 +169,8 @@ def adaptive_rows(
     knows = f"{prior.source}, and {PAST}, {INSTALLATION}"
     rows = [ComparedRow("adaptive", drive.errors, drive.path, knows)]
     if heading:
-        turned = partial(drive.errors, turned=True), partial(drive.path, turned=True)
-        rows.append(ComparedRow(f"adaptive_{heading}", *turned, knows))
+        gyro_functions = partial(drive.errors, turned=True), partial(drive.path, turned=True)
+        rows.append(ComparedRow(f"adaptive_{heading}", *gyro_functions, knows))
     return rows
 
 

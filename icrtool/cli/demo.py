@@ -19,7 +19,9 @@ def sample_log() -> Path:
     """Return the path of the sample log in the installed package, or in the checkout of the package."""
     package = Path(__file__).resolve().parents[1]
     folders = (package, package.parent)
-    return next((at for folder in folders if (at := folder / "sample_logs" / SAMPLE_LOG).is_file()), Path(SAMPLE_LOG))
+    return next(
+        (path for folder in folders if (path := folder / "sample_logs" / SAMPLE_LOG).is_file()), Path(SAMPLE_LOG)
+    )
 
 
 @click.command("demo")

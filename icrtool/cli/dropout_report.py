@@ -92,11 +92,11 @@ def dropout_report_command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
-    held = options.calibrations_of(calibrations, report)
+    opened_calibrations = options.calibrations_of(calibrations, report)
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)
     report = report.configured(config)
-    other_results = OtherResults(held, compared)
+    other_results = OtherResults(opened_calibrations, compared)
     sources, places = plan_sources(sources, place, config, printer)
     if report.score and (runs := [source for source in sources if source not in places]):
         why = f"{escaped(str(runs[0]))} is a run, which holds no poses of other topics"

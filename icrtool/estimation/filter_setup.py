@@ -373,9 +373,9 @@ def _response_variance(data: FilterInputs, width_m: float) -> Floats:
     small, and most of the error would go into the ICRs.
     """
     t = data.wheel_t
-    turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m
-    before, after = (np.interp(t + shift, t, turned) for shift in (-CHANGE_S, CHANGE_S))
-    change = (after - 2.0 * turned + before) / CHANGE_S
+    turn_rad = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m
+    before, after = (np.interp(t + shift, t, turn_rad) for shift in (-CHANGE_S, CHANGE_S))
+    change = (after - 2.0 * turn_rad + before) / CHANGE_S
     return np.asarray((CAUTIOUS_RESPONSE_STD_S * change) ** 2 / CHANGE_S)
 
 

@@ -318,8 +318,8 @@ def _lacking(
         return []
     unshown = ", ".join(f"{ICR_WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
     first = note("icrs_poorly_shown", f"this drive could not show the ICRs well: {unshown}")
-    turned = np.abs(windows.turned[1:])
-    steered = float(turned[turned > SURELY_TURNED_RAD].sum())
+    turns_rad = np.abs(windows.turned[1:])
+    steered = float(turns_rad[turns_rad > SURELY_TURNED_RAD].sum())
     turned_rad = turned_right + turned_left
     if steered > TURNS_NEEDED_RAD and turned_rad < STEERING_RATIO * steered:
         angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(turned_rad):.0f}°"

@@ -267,8 +267,8 @@ def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
     attitude = None if needs_positions else sensors.headings
     attitude = sensors.attitude if sensors.attitude is not None else attitude
     if attitude is not None and _covers(attitude.stamp_ns, stamps):
-        turned = unwrapped(attitude.heading_rad)
-        angle = np.interp(run.table.t_s, _since(attitude.stamp_ns, stamps), turned)
+        heading_rad = unwrapped(attitude.heading_rad)
+        angle = np.interp(run.table.t_s, _since(attitude.stamp_ns, stamps), heading_rad)
         yield MeasuredHeading("heading", angle)
 
 

@@ -115,9 +115,9 @@ def unusable_reasons(
     if wheel_scale is not None and wheel_scale.value is not None and wheel_scale.std is not None:
         remaining_scale = wheel_scale.value / wheel_scale.applied
         if wheel_scale.std < LARGEST_SCALE_STD and abs(remaining_scale - 1.0) > LARGEST_SCALE_CORRECTION:
-            far = f"the robot goes {100 * remaining_scale:.0f} % of the distance that the wheels report"
+            scale_text = f"the robot goes {100 * remaining_scale:.0f} % of the distance that the wheels report"
             # This reason comes first, because a wrong radius causes the other reasons.
-            reasons.insert(0, note("wheel_scale_wrong", far))
+            reasons.insert(0, note("wheel_scale_wrong", scale_text))
     if twist_separation is not None and not hidden:
         reasons += _twist_reasons(*twist_separation)
     return reasons

@@ -266,11 +266,18 @@ class AdaptiveModel:
     @property
     def now(self) -> Learned:
         """The model and constants that are known now."""
-        wheels, turned = self._wheels, self._turned
+        wheels_estimate, gyro_estimate = self._wheels, self._turned
         time_s = self._last[0] if self._last is not None else 0.0
-        if turned is None:
-            return Learned(time_s, self.distance_m, wheels.fitted, wheels.constants)
-        return Learned(time_s, self.distance_m, wheels.fitted, wheels.constants, turned.fitted, turned.constants)
+        if gyro_estimate is None:
+            return Learned(time_s, self.distance_m, wheels_estimate.fitted, wheels_estimate.constants)
+        return Learned(
+            time_s,
+            self.distance_m,
+            wheels_estimate.fitted,
+            wheels_estimate.constants,
+            gyro_estimate.fitted,
+            gyro_estimate.constants,
+        )
 
     def observe(
         self, t_s: float, v_left: float, v_right: float, pose: Sequence[float] | None = None, gyro_radps: float = 0.0,
@@ -289,16 +296,16 @@ class AdaptiveModel:
         """
         begin = self._begin_s = t_s if self._begin_s is None else self._begin_s
         north, east, heading = (np.nan, np.nan, np.nan) if pose is None else pose
-        at = t_s - begin
+        time_s = t_s - begin
         before = self.distance_m
         if self._last is not None:
             since, speed, unknown = self._last
-            advance = abs(speed) * (at - since)
-            if not unknown and at >= since and advance <= self._longest_m:
+            advance = abs(speed) * (time_s - since)
+            if not unknown and time_s >= since and advance <= self._longest_m:
                 self.distance_m += advance
-        self._last = at, (v_left + v_right) / 2.0, float(gap)
+        self._last = time_s, (v_left + v_right) / 2.0, float(gap)
         self._pending.append(
-            (at, v_left, v_right, north, east, heading, gyro_radps, pose is not None, float(broken), float(gap))
+            (time_s, v_left, v_right, north, east, heading, gyro_radps, pose is not None, float(broken), float(gap))
         )
         every = self._drive.every_m
         if math.floor(self.distance_m / every) == math.floor(before / every) and len(self._pending) < MOST_PENDING:

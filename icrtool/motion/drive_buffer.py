@@ -102,14 +102,21 @@ class DriveBuffer:
         heading = self._unwrapped(rows[SampleRow.HEADING, old:], is_known[old:])
         number, first = _step_of(rows, gap)
         # Knots are added first, because they count the steps that were complete before these samples.
-        at = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
-        row = old + at
-        pose = [np.where(is_known[row], column, 0.0) for column in (*rows[POSE_ROWS[:2]][:, row], heading[at])]
+        knot_rows = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
+        row = old + knot_rows
+        pose = [np.where(is_known[row], column, 0.0) for column in (*rows[POSE_ROWS[:2]][:, row], heading[knot_rows])]
         steps = self._steps_before + self._steps.shape[1] + number[row]
         self._knots = np.column_stack(
             [
                 self._knots,
-                [rows[SampleRow.T, row], *pose, segment[at], is_known[row], steps, self._samples + first[number[row]]],
+                [
+                    rows[SampleRow.T, row],
+                    *pose,
+                    segment[knot_rows],
+                    is_known[row],
+                    steps,
+                    self._samples + first[number[row]],
+                ],
             ]
         )
         self._close(rows, held, first)
@@ -196,11 +203,11 @@ class DriveBuffer:
 
 def _intervals(rows: Floats, size: float) -> tuple[Floats, Floats, Bools]:
     """Return for each sample but the last: time that it holds [s], distance of the wheels [m], whether it is a gap."""
-    held = np.diff(rows[SampleRow.T])
-    advance = np.abs((rows[SampleRow.LEFT, :-1] + rows[SampleRow.RIGHT, :-1]) / 2.0) * held
-    gap = (rows[SampleRow.GAP, :-1] > 0.0) | ~(held >= 0.0) | ~(advance <= LARGEST_ADVANCE_M * size)
-    held[gap] = advance[gap] = 0.0
-    return held, advance, gap
+    duration_s = np.diff(rows[SampleRow.T])
+    advance = np.abs((rows[SampleRow.LEFT, :-1] + rows[SampleRow.RIGHT, :-1]) / 2.0) * duration_s
+    gap = (rows[SampleRow.GAP, :-1] > 0.0) | ~(duration_s >= 0.0) | ~(advance <= LARGEST_ADVANCE_M * size)
+    duration_s[gap] = advance[gap] = 0.0
+    return duration_s, advance, gap
 
 
 def _step_of(rows: Floats, gap: Bools) -> tuple[Ints, Ints]:

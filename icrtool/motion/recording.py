@@ -180,12 +180,12 @@ def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
     A step is 0.1 s long; on a long drive it is longer, at most 0.4 s and 0.25 m. `pooled_s` is the time of all
     recordings that are fitted together.
     """
-    held = recording.track.held
-    lasting, travel = held > 0.0, np.empty(len(held))
+    duration_s = recording.track.held
+    lasting, travel = duration_s > 0.0, np.empty(len(duration_s))
     if not lasting.any():
         return 1
-    total_s = float(held.sum())
-    for lo in range(0, len(held), ROWS_AT_ONCE):
+    total_s = float(duration_s.sum())
+    for lo in range(0, len(duration_s), ROWS_AT_ONCE):
         chunk = slice(lo, lo + ROWS_AT_ONCE)
         wheels = recording.wheels(chunk)
         travel[chunk] = wheels.held * (np.abs(wheels.v_left) + np.abs(wheels.v_right))
@@ -195,7 +195,7 @@ def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
         LONGEST_STEP_M / max(speed_mps, 1e-3),
         LONGEST_RECORDING_STEP_S,
     )
-    return max(int(max(step_s, RECORDING_STEP_S) / float(np.median(held[lasting], overwrite_input=True))), 1)
+    return max(int(max(step_s, RECORDING_STEP_S) / float(np.median(duration_s[lasting], overwrite_input=True))), 1)
 
 
 def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:
@@ -390,22 +390,22 @@ class GyroLine(NamedTuple):
         return abs(abs(self.scale) - 1.0) < GYRO_SCALE_RANGE
 
 
-def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: Floats) -> GyroLine:
+def fit_gyro_line(t: Floats, rate: Floats, gyro_turn: Floats, heading_t: Floats, heading: Floats) -> GyroLine:
     """Return scale, bias and lead that map the turns of a gyro over `TURN_S` to the turns of the reference.
 
     Parameters
     ----------
-    t : (n,) times [s]; rate : (n,) of the gyro [rad/s]; turned : (n,) its integral [rad]
-    at : (m,) times of the headings [s], ascending; heading : (m,) of the reference, unwrapped [rad]
+    t : (n,) times [s]; rate : (n,) of the gyro [rad/s]; gyro_turn : (n,) its integral [rad]
+    heading_t : (m,) times of the headings [s], ascending; heading : (m,) of the reference, unwrapped [rad]
     """
-    every = rows_at_steps(at - at[0], TURN_S)
+    every = rows_at_steps(heading_t - heading_t[0], TURN_S)
     if len(every) < FEWEST_TURNS:
         return GyroLine(float("nan"), float("nan"), 0.0)
-    reference_turns, durations_s = np.diff(heading[every]), np.diff(at[every])
+    reference_turns, durations_s = np.diff(heading[every]), np.diff(heading_t[every])
 
     def evaluate(x: Floats) -> tuple[Floats, Floats]:
-        read = at[every] + x[2]
-        by_scale, by_lead = (np.diff(np.interp(read, t, column)) for column in (turned, rate))
+        read = heading_t[every] + x[2]
+        by_scale, by_lead = (np.diff(np.interp(read, t, column)) for column in (gyro_turn, rate))
         residuals = x[0] * by_scale + x[1] * durations_s - reference_turns
         return residuals, np.column_stack([by_scale, durations_s, x[0] * by_lead])
 

@@ -37,10 +37,10 @@ ONCE: Parts = {"": ()}
 def _histograms(report: DropoutReport, *, together: bool) -> Parts:
     """Return the parts of histograms: one figure of all horizons with trials, or one figure for each horizon."""
     trials = {row.horizon_m: row.trials for row in report.document.trials}
-    horizons_m = tuple(metres for metres in HISTOGRAM_HORIZONS_M if trials.get(metres))
+    horizons_m = tuple(horizon_m for horizon_m in HISTOGRAM_HORIZONS_M if trials.get(horizon_m))
     if together:
         return {"": horizons_m} if horizons_m else {}
-    return {f"{metres:02.0f}m": (metres,) for metres in horizons_m}
+    return {f"{horizon_m:02.0f}m": (horizon_m,) for horizon_m in horizons_m}
 
 
 class Entry(NamedTuple):

@@ -243,9 +243,9 @@ def format_twist(calibration: Calibration) -> str:
     `v_x`, `v_y` and `yaw_rate` are each the sum of the products of value and formula.
     """
     fitted_model = calibration.fitted
-    free = [TERMS[name] for name in fitted_model.model.terms]
-    signs = np.array([sign_in_rep103(term) for term in free])
-    fixed = [term for term in TERMS.values() if term.nominal and term not in free]
+    terms = [TERMS[name] for name in fitted_model.model.terms]
+    signs = np.array([sign_in_rep103(term) for term in terms])
+    fixed = [term for term in TERMS.values() if term.nominal and term not in terms]
     geometry, stds = calibration.geometry, calibration.geometry_std
     p95, expected = calibration.held_out_m("recommended", POSE_AFTER_M)
     document = {
@@ -263,7 +263,7 @@ def format_twist(calibration: Calibration) -> str:
             {"name": term.name, "output": AXES[term.axis], "formula": term.formula, "value": value, "std": std}
             for term, value, std in [
                 *((term, sign_in_rep103(term) * term.nominal, 0.0) for term in fixed),
-                *zip(free, (signs * fitted_model.parameters).tolist(), fitted_model.std.tolist(), strict=True),
+                *zip(terms, (signs * fitted_model.parameters).tolist(), fitted_model.std.tolist(), strict=True),
             ]
         ],
         "covariance": {

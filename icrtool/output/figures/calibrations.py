@@ -55,14 +55,14 @@ def forecast_figure(
     answer = f"{error_text(forecast.p95_m[-1])} off (95 %) at the end of {total_m:.0f} m"
     if reached is not None:
         answer = f"Within {budgets_m[0]:g} m (95 %) for {reached[0]:.1f} m, {answer}"
-    by = "wheels alone" if gyro is None else "wheels alone, and with gyro"
+    models_text = "wheels alone" if gyro is None else "wheels alone, and with gyro"
     # The legend has both errors of each forecast, the budgets, and up to four more entries.
     entries = 2 * (1 if gyro is None else 2) + len(budgets_m) + 4
     keys_in = style.KEY_ROW_IN * max(-(-entries // FORECAST_KEY_COLUMNS) - 2, 0)
     height_in, margins_in = 4.5 + keys_in, (0.8, 0.25, 0.75, 1.05 + keys_in)
     layout = {"width_in": 8.2, "height_in": height_in, "wspace": 0.28}
     sheet = new_sheet(
-        answer, f"{title}: forecast from the start without GNSS, {by}", ax, margins_in=margins_in, **layout
+        answer, f"{title}: forecast from the start without GNSS, {models_text}", ax, margins_in=margins_in, **layout
     )
     error_axes, path_axes = sheet.subplots(1, 2)[0]
     for drawn, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
@@ -261,10 +261,10 @@ def _errors_of_groups(comparison: GroupComparison) -> list[Difference]:
     cells.sort(key=lambda cell: (list(comparison.groups).index(cell.tested_on), cell.calibrated_on != cell.tested_on))
     rows = []
     for cell in cells:
-        by = "own" if cell.calibrated_on == cell.tested_on else f"by {_group(cell.calibrated_on)}'s"
+        owner = "own" if cell.calibrated_on == cell.tested_on else f"by {_group(cell.calibrated_on)}'s"
         rows.append(
             Difference(
-                f"{_group(cell.tested_on)}, {by} calibration", cell.p95_m or 0.0, cell.p95_low_m, cell.p95_high_m
+                f"{_group(cell.tested_on)}, {owner} calibration", cell.p95_m or 0.0, cell.p95_low_m, cell.p95_high_m
             )
         )
     return rows

@@ -194,7 +194,7 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
         The report holds none of them; make it with `icrtool.dropout_report`.
     """
     outages = _require(report, report.outages, "outages")
-    norths, easts, whole = _view_of_outages(report, outages)
+    norths, easts, shows_all = _view_of_outages(report, outages)
     width_in = style.WIDTH_IN - 0.95
     box_in = fitted_box_in(norths, easts, width_in)
     parts = []
@@ -207,7 +207,7 @@ def dropout_outages(report: DropoutReport, *, ax: Axes | None = None) -> Figure 
             parts.append(f"{len(ours)} {kind} of {span}, up to {error_text(worst)}")
     largest = max(outage.document.end_error_m or 0.0 for outage in outages)
     title = f"Without {fix_word(report.run_document)} the robot ends up to {error_text(largest)} off"
-    part = "" if whole else "; a part of the path"
+    part = "" if shows_all else "; a part of the path"
     subtitle = f"{run_title(report.run_document)}: {'; '.join(parts)}{part}"
     sheet = new_sheet(title, subtitle, ax, height_in=box_in + 1.65)
     axes = sheet.subplots()[0, 0]

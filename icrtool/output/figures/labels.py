@@ -77,7 +77,7 @@ def write_labels(
     occupied = np.concatenate([spots - half, spots + half], axis=1)
     for label, spot in zip(labels, spots, strict=False):
         width, height = (size_pt / SIZE_PT * point_px * part for part in (CHARACTER_PT * len(label.text), LINE_PT))
-        second, free = None, None
+        second_spot, free_spot = None, None
         for dx, dy in (offset for offset in OFFSETS_PT if math.hypot(*offset) <= farthest_pt):
             x, y = spot + point_px * np.array([dx, dy]) - (width if dx <= 0 else 0.0, height / 2)
             box = np.array([x, y, x + width, y + height])
@@ -85,13 +85,13 @@ def write_labels(
             if not inside or _overlaps(box, occupied).any():
                 continue
             if not _overlaps(box, np.tile(crossed, 2)).any():
-                free = dx, dy, box
+                free_spot = dx, dy, box
                 break
-            second = second or (dx, dy, box)
-        free = free or (second if crossing else None)
-        if free is None:
+            second_spot = second_spot or (dx, dy, box)
+        free_spot = free_spot or (second_spot if crossing else None)
+        if free_spot is None:
             continue
-        dx, dy, box = free
+        dx, dy, box = free_spot
         written.append(label)
         occupied = np.concatenate([occupied, box[None]])
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(dx, dy) > LINE_FROM_PT else None

@@ -207,15 +207,15 @@ def draw_estimates(
 def draw_starts(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw y_icr_right of one run along time, from each start whose y_icr_left is nearest to the truth."""
     right, left, _ = result.request.plan.icrs_m
-    near = min(sorted(result.request.values), key=lambda value: abs(value - left))
+    nearest = min(sorted(result.request.values), key=lambda value: abs(value - left))
     for level in levels:
-        if level.names["start_y_icr_left_m"] == near:
+        if level.names["start_y_icr_left_m"] == nearest:
             trace = level.found["trace"][:1]
             draw_percentiles(axes, trace[0, :, 0], trace[..., 1], {"color": "0.35"})
     axes.axhline(right, color=STUDY_LOOKS[0]["color"], **TRUTH)
     reach = BEYOND * max(LEAST_VIEW_M, *map(abs, result.request.values))
     axes.set_ylim(-reach, reach)
-    axes.set_title(f"start y left {near:g} m", loc="left")
+    axes.set_title(f"start y left {nearest:g} m", loc="left")
 
 
 def draw_fates(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
@@ -268,8 +268,10 @@ def draw_nees(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None
 def draw_coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the share of the time in which the truth is within 2 sigma, by state."""
     for series_index, (level, look) in enumerate(zip(levels, STUDY_LOOKS, strict=False)):
-        held = consistency_of(level.found)["coverage_pct"]
-        _draw_points(axes, STUDY_STATES, [(share, share, share) for share in held], look, 0.15 * (series_index - 1))
+        coverage_pct = consistency_of(level.found)["coverage_pct"]
+        _draw_points(
+            axes, STUDY_STATES, [(share, share, share) for share in coverage_pct], look, 0.15 * (series_index - 1)
+        )
     axes.axhline(95.4, color="black", **TRUTH)
 
 

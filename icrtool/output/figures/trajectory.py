@@ -105,8 +105,8 @@ def trajectory(run: Run, *, ax: Axes | None = None) -> Figure | Axes:
     )
     width_in = style.WIDTH_IN - PATH_MARGINS_IN[0] - PATH_MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
-    off = [f"{ODOMETRIES[name][1]} {distance_text(path.end_error_m)}" for name, path in paths.items()]
-    title = f"Wheels end off: {', '.join(off)}"
+    end_errors = [f"{ODOMETRIES[name][1]} {distance_text(path.end_error_m)}" for name, path in paths.items()]
+    title = f"Wheels end off: {', '.join(end_errors)}"
     subtitle = f"{run_title(run.document)}: {driven_text(run.document.drive)}"
     height_in = box_in + PATH_MARGINS_IN[2] + PATH_MARGINS_IN[3]
     sheet = new_sheet(title, subtitle, ax, height_in=height_in, margins_in=PATH_MARGINS_IN)

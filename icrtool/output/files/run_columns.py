@@ -131,12 +131,12 @@ def read_states(place: Place, file_format: StatesFormat, *, whole: bool = True) 
                 if 8 * numbers > FREE_STATES_BYTES + LARGEST_RATIO * os.fstat(source.fileno()).st_size:
                     raise ValueError(f"it claims {numbers} numbers, more than a file of its size can hold")
                 _check_columns(file.schema_arrow, types)
-                held = {
+                columns_in_memory = {
                     name: _parquet_column(file, name) for name in COLUMNS_OF_STATES if whole or name not in DEVIATIONS
                 }
                 read = partial(_read_again, place, _identity(source))
             pa.default_memory_pool().release_unused()
-            return States(**held) if whole else StoredStates(read, **held)
+            return States(**columns_in_memory) if whole else StoredStates(read, **columns_in_memory)
         import pyarrow.csv as pc
 
         options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS_OF_STATES), null_values=[])

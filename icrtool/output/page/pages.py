@@ -517,14 +517,18 @@ def comparison_page(comparison: GroupComparison, title: str) -> str:
 
 def _comparison_answer(comparison: GroupComparison, verdict: Section) -> Section:
     """Return the answer of a comparison as cards: errors of the groups, a chart, and the verdicts."""
-    at = f"after {CHOICE_HORIZON_M:g} m"
+    horizon_text = f"after {CHOICE_HORIZON_M:g} m"
     own_errors = (cell for cell in comparison.transfer if cell.calibrated_on == cell.tested_on)
     rows = [_row_of_errors(cell.tested_on, cell, "") for cell in own_errors if cell.horizon_m == CHOICE_HORIZON_M]
     for pair in comparison.pairs:
         at_choice = (difference for difference in pair.errors if difference.horizon_m == CHOICE_HORIZON_M)
         rows += [_row_of_errors(f"{pair.second} − {pair.first}", difference, "+") for difference in at_choice]
-    errors = Table("lrr", [row for row in rows if row[1]], (f"95 % error {at}", "error", "95 % interval"))
-    chart = Chart("groups", f"95 % error {at} of each group", f"95 % error {at} of each group, with 95 % interval.")
+    errors = Table("lrr", [row for row in rows if row[1]], (f"95 % error {horizon_text}", "error", "95 % interval"))
+    chart = Chart(
+        "groups",
+        f"95 % error {horizon_text} of each group",
+        f"95 % error {horizon_text} of each group, with 95 % interval.",
+    )
     cards = [
         Section("How large is the error?", [errors], name="reach"),
         Section("Side by side", [Figure((), "groups", (chart,))], name="worst-case"),

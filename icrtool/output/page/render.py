@@ -205,8 +205,8 @@ def pictures_of(files: Iterable[tuple[str, bytes]]) -> dict[str, Picture]:
 
     pictures = {}
     for name, content in files:
-        if (of_catalogue := entry_of(name)) is not None:
-            entry, metres = of_catalogue
+        if (catalogue_entry := entry_of(name)) is not None:
+            entry, metres = catalogue_entry
             source = f"data:image/png;base64,{b64encode(content).decode('ascii')}"
             pictures[name] = Picture(entry.title.format(metres), entry.caption, source, entry.with_place)
     return pictures

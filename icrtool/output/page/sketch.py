@@ -52,9 +52,9 @@ def drive_sketch(run: Run, report: DropoutDocument) -> Sketch:
     """Return the drive of a run from above, with the trial of the largest error."""
     north, east = run.table.north_m, run.table.east_m
     low, high = np.array([east.min(), north.min()]), np.array([east.max(), north.max()])
-    free = np.array([WIDTH, HEIGHT]) - 2.0 * MARGIN
+    drawable = np.array([WIDTH, HEIGHT]) - 2.0 * MARGIN
     # The view is at least one metre wide, because the drive of a robot that stands has no extent.
-    scale = float(np.min(free / np.maximum(high - low, 1.0)))
+    scale = float(np.min(drawable / np.maximum(high - low, 1.0)))
     middle = (low + high) / 2.0
 
     def points(begin: int, end: int) -> Iterator[tuple[float, float]]:

@@ -292,11 +292,11 @@ def forecast_document(
     columns = {name: column.tolist() for name, column in _columns(forecast, gyro).items()}
     reaches = [
         (
-            metres,
-            finite_or_none(distance_within(forecast, metres)),
-            UNSET if gyro is None else finite_or_none(distance_within(gyro, metres)),
+            budget_m,
+            finite_or_none(distance_within(forecast, budget_m)),
+            UNSET if gyro is None else finite_or_none(distance_within(gyro, budget_m)),
         )
-        for metres in budgets_m
+        for budget_m in budgets_m
     ]
     return documents.ForecastDocument(
         schema="icrtool/forecast/1",
@@ -332,10 +332,10 @@ def forecast_blocks(
     model = f"{model_text(calibration.fitted)} from {counted(len(calibration.logs), 'log')}"
     kinds = [("", forecast)] if gyro is None else [("", forecast), (", with gyro", gyro)]
     rows = []
-    for metres in sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)}):
-        k = int(metres) - 1
+    for distance_m in sorted({*(distance_m for distance_m in SHOWN_M if distance_m < total), math.floor(total)}):
+        k = int(distance_m) - 1
         errors = [f"{column[k]:.2f}" for _, along in kinds for column in (along.expected_m, along.p95_m)]
-        rows.append((f"{metres:g}", *errors, f"{forecast.heading_std_deg[k]:.1f}"))
+        rows.append((f"{distance_m:g}", *errors, f"{forecast.heading_std_deg[k]:.1f}"))
     head = [f"{name}{suffix} [m]" for suffix, _ in kinds for name in ("expected", "95 %")]
     blocks: list[Block] = [
         f"{distance_text(total)} without GNSS from the start, wheels alone; {model}",
@@ -346,7 +346,8 @@ def forecast_blocks(
     for budget in budgets_m:
         distances = [(suffix, distance_within(along, budget)) for suffix, along in kinds]
         reached = [
-            f"{'the whole path' if metres >= total else f'{metres:.1f} m'}{suffix}" for suffix, metres in distances
+            f"{'the whole path' if distance_m >= total else f'{distance_m:.1f} m'}{suffix}"
+            for suffix, distance_m in distances
         ]
         blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
     if total > (longest := measured_to_m(calibration)):

@@ -41,7 +41,7 @@ def shown_horizons(horizons_m: Floats) -> list[int]:
     """Return the indices of the horizons (h,) nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
     if len(horizons_m) <= len(SHOWN_HORIZONS_M):
         return list(range(len(horizons_m)))
-    nearest = (int(np.argmin(np.abs(horizons_m - metres))) for metres in SHOWN_HORIZONS_M)
+    nearest = (int(np.argmin(np.abs(horizons_m - shown_m))) for shown_m in SHOWN_HORIZONS_M)
     return sorted(set(nearest))
 
 

@@ -252,8 +252,8 @@ def excitation_check(document: RunDocument) -> Check:
     """Return the check of the information about the ICRs; for an ICR that is not shown, what to drive."""
     excitation, drive = document.excitation, to_drive(document)
     spun = excitation.spun_right_deg + excitation.spun_left_deg
-    turned = f"turned {excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
-    more = (f"{turned}, {spun:,.0f}° of it on the spot",)
+    turns_text = f"turned {excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
+    more = (f"{turns_text}, {spun:,.0f}° of it on the spot",)
     if excitation.verdict.all_shown:
         text = f"shown, but {drive}" if drive else "all three ICRs shown: enough turns for each"
         return Check("care" if drive else "good", "excitation", text, more)
@@ -383,7 +383,7 @@ def _odometry_table(document: RunDocument) -> Iterator[Table]:
     names = {"final ICRs": "icr", "momentary ICRs": "icr_momentary", "no slip": "no_slip"}
     errors = {words: getattr(document.odometry, name) for words, name in names.items()}
     rows = [
-        (words, *(error_text(metres) for metres in (path.mean_error_m, path.max_error_m, path.end_error_m)))
+        (words, *(error_text(error_m) for error_m in (path.mean_error_m, path.max_error_m, path.end_error_m)))
         for words, path in errors.items()
         if path is not None and path is not UNSET and path.mean_error_m is not UNSET
     ]
