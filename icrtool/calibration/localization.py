@@ -34,7 +34,7 @@ DECLINATION_STD_DEG = 0.4
 """Standard deviation of the World Magnetic Model's declination [deg], as its authors state it for medium latitudes."""
 
 
-class Estimate(NamedTuple):
+class SourcedValue(NamedTuple):
     """A number, its standard deviation (None where it has none), and its source."""
 
     value: float
@@ -65,11 +65,11 @@ class Localization(NamedTuple):
     left_out : parameter and reason for each number that the drive does not show
     """
 
-    twist: tuple[Estimate, Estimate, Estimate]
-    gyro_rate: Estimate | None
-    process: dict[str, Estimate]
-    declination_rad: Estimate | None
-    yaw_offset_rad: Estimate | None
+    twist: tuple[SourcedValue, SourcedValue, SourcedValue]
+    gyro_rate: SourcedValue | None
+    process: dict[str, SourcedValue]
+    declination_rad: SourcedValue | None
+    yaw_offset_rad: SourcedValue | None
     antenna: AntennaPlace | None
     wheel_topic: str
     imu_topic: str
@@ -93,14 +93,14 @@ def localization(calibration: Calibration, run: Run | None = None) -> Localizati
     source = f"held-out errors of the controller's model over {TWIST_OVER_M:g} m"
     stds = errors.twist_variance_std or (None, None, None)
     v_x, v_y, yaw_rate = (
-        Estimate(*variance_and_std, source) for variance_and_std in zip(errors.twist_variance, stds, strict=True)
+        SourcedValue(*variance_and_std, source) for variance_and_std in zip(errors.twist_variance, stds, strict=True)
     )
     gyro_rate = None
     if errors.gyro_rate_variance is not None:
         gyro_origin = (
             f"held-out errors of the model with the gyro over {TWIST_OVER_M:g} m, the reference's noise included"
         )
-        gyro_rate = Estimate(errors.gyro_rate_variance, errors.gyro_rate_variance_std, gyro_origin)
+        gyro_rate = SourcedValue(errors.gyro_rate_variance, errors.gyro_rate_variance_std, gyro_origin)
     left_out = [] if gyro_rate is not None else ["imu0: no gyro that turns with the robot"]
     if run is None:
         left_out += [
@@ -132,7 +132,7 @@ def _is_odometry(stream: object) -> bool:
     return getattr(stream, "message_type", "") == "nav_msgs/Odometry"
 
 
-def _pose_noise(run: Run) -> dict[str, Estimate]:
+def _pose_noise(run: Run) -> dict[str, SourcedValue]:
     """Return the process noise of x, y [m^2/s] and yaw [rad^2/s] that the filter ran with.
 
     Notes
@@ -141,7 +141,7 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
     robot_localization adds dt Q.
     """
     used, settings, configured = run.document.filter, run.config.filter, configured_noise(run.config)
-    estimates: dict[str, Estimate] = {}
+    estimates: dict[str, SourcedValue] = {}
     for names, std, unit, first, key, is_searched in (
         (("x", "y"), used.process_position_mps, "m/s", configured.position_mps, "process_position_mps",
          settings.process_position_mps == "auto"),
@@ -153,11 +153,11 @@ def _pose_noise(run: Run) -> dict[str, Estimate]:
             origin = f"raised from {first:g} by the filter's innovations"
         source = f"({std:g} {unit})² × {REFERENCE_STEP_S:g} s, filter.{key}: {origin}"
         value = REFERENCE_STEP_S * (math.radians(std) if unit == "deg/s" else std) ** 2
-        estimates |= {name: Estimate(value, None, source) for name in names}
+        estimates |= {name: SourcedValue(value, None, source) for name in names}
     return estimates
 
 
-def _speed_noise(calibration: Calibration, run: Run) -> dict[str, Estimate]:
+def _speed_noise(calibration: Calibration, run: Run) -> dict[str, SourcedValue]:
     """Return the process noise of v_x [m^2/s^3] and of the yaw rate [rad^2/s^3]; empty if the drive is too short.
 
     Notes
@@ -183,7 +183,7 @@ def _speed_noise(calibration: Calibration, run: Run) -> dict[str, Estimate]:
     }
 
 
-def _mean_of_blocks(squares: Floats, block: Ints, lasted_s: float) -> Estimate:
+def _mean_of_blocks(squares: Floats, block: Ints, lasted_s: float) -> SourcedValue:
     """Return the mean of squared changes (n,), with a standard deviation from the means of their blocks.
 
     Parameters
@@ -194,10 +194,12 @@ def _mean_of_blocks(squares: Floats, block: Ints, lasted_s: float) -> Estimate:
     count = np.bincount(block)
     means = np.bincount(block, weights=squares) / count
     std = float(means.std() / math.sqrt(len(means)))
-    return Estimate(float(squares.mean()), std, f"changes of the wheels' speed within {lasted_s:.3g} s, while moving")
+    return SourcedValue(
+        float(squares.mean()), std, f"changes of the wheels' speed within {lasted_s:.3g} s, while moving"
+    )
 
 
-def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
+def _yaw(run: Run) -> tuple[SourcedValue | None, SourcedValue | None, str]:
     """Return the declination and the offset [rad] with which the IMU's yaw counts from east, and why there are none.
 
     Notes
@@ -224,15 +226,15 @@ def _yaw(run: Run) -> tuple[Estimate | None, Estimate | None, str]:
     compared = f"heading minus course over ground {heading.offset_deg:+z.2f} deg, {heading.windows} windows"
     if heading.applied_offset_deg == 0.0:
         compared += ": too small to correct"
-    declination = Estimate(0.0, None, "no declination shown: yaw_offset is the whole offset")
+    declination = SourcedValue(0.0, None, "no declination shown: yaw_offset is the whole offset")
     declination_deg = heading.magnetic_declination_deg
     if declination_deg is not None and "magnetic declination" in (heading.offset_name or ""):
         north = f"magnetic north is {declination_deg:+z.1f} deg east of north"
         words = f"World Magnetic Model: {north}; the sign is that of ENU"
-        declination = Estimate(-math.radians(declination_deg), math.radians(DECLINATION_STD_DEG), words)
+        declination = SourcedValue(-math.radians(declination_deg), math.radians(DECLINATION_STD_DEG), words)
         compared += ", without the declination"
     offset = math.remainder(applied - declination.value, 2.0 * math.pi)
-    return declination, Estimate(offset, None if std is None else math.radians(std), compared), ""
+    return declination, SourcedValue(offset, None if std is None else math.radians(std), compared), ""
 
 
 def _antenna(run: Run) -> tuple[AntennaPlace | None, str]:

@@ -83,8 +83,7 @@ def fit_command(
     for log, run_place in zip(logs, run_directories(logs, place), strict=True):
         with inputs.document_of(log) as document:
             with fitted_log(log, run_place, config, request, files, printer, warm_start, warns=False) as (run, _):
-                pass
-            all_usable = all_usable and run.usable
+                all_usable = all_usable and run.usable
             if strict and not (run.usable or printer.shows):
                 print_error(f"{run.name}: do not use this run: {run.document.unusable_because}")
             where = escaped(str(path_of(run_place)))

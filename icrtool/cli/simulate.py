@@ -65,7 +65,7 @@ def change_text(text: str) -> tuple[float, tuple[float, ...]]:
 
 
 def span_text(text: str) -> tuple[float, ...]:
-    """Return begin and end [s] in a text ``BEGIN:END``; refuse a span that ends before it begins."""
+    """Return start and end [s] in a text ``BEGIN:END``; refuse a span that ends before it begins."""
     span = numbers_reader("BEGIN:END", 2)(text.replace(":", ",", 1) if ":" in text else "")
     if span[1] <= span[0]:
         raise click.BadParameter(f"{text!r} ends before it begins")

@@ -214,7 +214,7 @@ def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple
     Parameters
     ----------
     length_s : length of the outages
-    at_s : begins of the outages, in seconds since the first state; empty: evenly spaced over the moving time
+    at_s : starts of the outages, in seconds since the first state; empty: evenly spaced over the moving time
 
     Raises
     ------

@@ -55,7 +55,7 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
 
 
 def _span(t_s: Floats, estimate: Floats, std: Floats) -> tuple[float, float] | None:
-    """Return begin and end [s] of the convergence of an estimate (n,) with a standard deviation (n,)."""
+    """Return start and end [s] of the convergence of an estimate (n,) with a standard deviation (n,)."""
     settled, noise = (float(np.median(column[len(column) // 2 :])) for column in (estimate, std))
     change = settled - float(estimate[0])
     if abs(change) < max(SMALLEST_CHANGE_M, noise / (1.0 - LEARNED_SHARE)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 
-from icrtool.calibration.localization import Estimate, Localization
+from icrtool.calibration.localization import Localization, SourcedValue
 from icrtool.calibration.record import Calibration, export_notes
 from icrtool.motion.models import FIVE
 from icrtool.output.exports.controllers import NOT_PLANAR, export_origin, one_line, yaml_number
@@ -137,13 +137,13 @@ def _left_out(numbers: Localization) -> list[str]:
     return ["# Left out, because the drive does not show it:", *lines] if numbers.left_out else []
 
 
-def _value(key: str, estimate: Estimate) -> list[str]:
+def _value(key: str, estimate: SourcedValue) -> list[str]:
     """Return a parameter [rad] below a comment with its standard deviation and source."""
     deviation = "" if estimate.std is None else f" ± {estimate.std:.4f} rad ({math.degrees(estimate.std):.1f} deg)"
     return [*_inner(estimate.source), f"    {key}: {estimate.value:z.4f}{f'  #{deviation}' if deviation else ''}"]
 
 
-def _estimate(estimate: Estimate, unit: str = "") -> str:
+def _estimate(estimate: SourcedValue, unit: str = "") -> str:
     """Return a number with its standard deviation, as ``0.0012 ± 0.0003 m²/s²``; ``(no σ)`` without one."""
     deviation = f"± {estimate.std:.2g}" if estimate.std is not None else "(no σ)"
     return f"{estimate.value:.4g} {deviation} {unit}".rstrip()

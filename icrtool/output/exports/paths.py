@@ -157,7 +157,7 @@ def line_rows(x_m: Floats, y_m: Floats) -> Ints:
 
 
 def outage_rows(run: Run) -> Iterator[tuple[tuple[int, int], slice]]:
-    """Yield begin and end [ns] of each outage, and the states in it."""
+    """Yield start and end [ns] of each outage, and the states in it."""
     stamps = run.table.stamp_ns
     for begin_ns, end_ns in run.outages_ns.tolist():
         first, last = np.searchsorted(stamps, [begin_ns, end_ns])
