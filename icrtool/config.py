@@ -38,7 +38,7 @@ Duration = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
 Std = Annotated[float, msgspec.Meta(gt=0, le=1e4)]
 Noise = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
-Place = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
+Coordinate = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Delay = Annotated[float, msgspec.Meta(ge=-100, le=100)]
 Degrees = Annotated[float, msgspec.Meta(ge=-720, le=720)]
 SideScale = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
@@ -120,8 +120,8 @@ class FramesConfig:
     reference_delay_s: Literal["auto"] | Delay = "auto"
     heading_delay_s: Literal["auto"] | Delay = "auto"
     gyro_delay_s: Literal["auto"] | Delay = "auto"
-    antenna_forward_m: Literal["auto"] | Place = "auto"
-    antenna_right_m: Literal["auto"] | Place = "auto"
+    antenna_forward_m: Literal["auto"] | Coordinate = "auto"
+    antenna_right_m: Literal["auto"] | Coordinate = "auto"
     datum: tuple[Latitude, Longitude] | None = None
 
 
@@ -135,9 +135,9 @@ class FilterConfig:
     """
 
     preset: Literal["field", "paper"] = "field"
-    initial_y_icr_right_m: Place | None = None
-    initial_y_icr_left_m: Place | None = None
-    initial_x_icr_m: Place | None = None
+    initial_y_icr_right_m: Coordinate | None = None
+    initial_y_icr_left_m: Coordinate | None = None
+    initial_x_icr_m: Coordinate | None = None
     initial_icr_std_m: Std | None = None
     process_position_mps: Literal["auto"] | Noise = "auto"
     process_heading_degps: Noise | None = None

@@ -30,7 +30,7 @@ from icrtool.alignment.wheel_alignment import bridge_gaps
 from icrtool.alignment.wheel_units import with_right_size, with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
-from icrtool.records.measurements import Finding, LogFacts, Measurements, SensorData
+from icrtool.records.measurements import AlignmentEstimate, LogFacts, Measurements, SensorData
 from icrtool.records.notes import note, notes_about
 from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run import width_or_usual_m
@@ -78,8 +78,8 @@ def align(log: RobotLog, config: Config) -> Measurements:
     filled, bridge = bridge_gaps(measurements.sensors.wheels, config.filter.wheel_gap_s, measurements.sensors.fixes)
     notes = notes_about(log.name, [*shifts.notes, *([] if bridge is None else [bridge])])
     sensors = replace(measurements.sensors, wheels=filled, events=disagreements.events, jumps=disagreements.jumps)
-    findings = with_shifts(with_shifts(measurements.findings, configured_shifts), shifts)
-    measurements = _with_size(replace(measurements, findings=findings), size)
+    estimates = with_shifts(with_shifts(measurements.estimates, configured_shifts), shifts)
+    measurements = _with_size(replace(measurements, estimates=estimates), size)
     return replace(measurements, sensors=sensors, notes=(*measurements.notes, *notes))
 
 
@@ -97,16 +97,16 @@ def _with_size(found: Measurements, factor: float) -> Measurements:
         applied_right_scale=factor * facts.applied_right_scale,
     )
     scaled = {
-        name: Finding(
-            None if finding.value is None else factor * finding.value,
-            None if finding.std is None else factor * finding.std,
-            factor * finding.applied,
+        name: AlignmentEstimate(
+            None if estimate.value is None else factor * estimate.value,
+            None if estimate.std is None else factor * estimate.std,
+            factor * estimate.applied,
             "corrected",
         )
         for name in ("wheel_scale", "left_scale", "right_scale")
-        if (finding := found.findings.get(name)) is not None
+        if (estimate := found.estimates.get(name)) is not None
     }
-    return replace(found, wheels=wheels, findings={**found.findings, **scaled})
+    return replace(found, wheels=wheels, estimates={**found.estimates, **scaled})
 
 
 def _align_once(log: RobotLog, config: Config) -> Measurements:
@@ -118,7 +118,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
     quality = grade_fixes(streams.log, config, fix_steps, position_std_m)
     check_streams(streams.log)
     headings, antenna_m = streams.log.heading, _antenna_m(log, config)
-    findings = alignment_findings(streams, antenna_m)
+    estimates = alignment_estimates(streams, antenna_m)
     if derived is None:
         noise = heading_variance(headings, config.filter, math.radians(heading.applied_std_deg), heading_std_rad)
         corrected = headings.heading_rad - math.radians(heading.applied_offset_deg)
@@ -146,7 +146,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
     )
     return Measurements(
         sensors=sensors,
-        findings=findings,
+        estimates=estimates,
         wheels=streams.wheels,
         heading=heading,
         streams=streams.log.streams,
@@ -209,7 +209,7 @@ NOT_A_CORRECTION = "compared with the filter's ICRs"
 """Reason in findings about ICRs, which correct no stream."""
 
 
-def alignment_findings(streams: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
+def alignment_estimates(streams: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, AlignmentEstimate]:
     """Return all estimates of the alignment by their names, which end with the unit.
 
     Without a fit there are no scales of single sides and no ICRs.
@@ -220,36 +220,36 @@ def alignment_findings(streams: AlignedStreams, antenna_m: tuple[float, float]) 
     """
     wheels, heading, delays = streams.wheels, streams.heading, streams.delays
     offset = None if heading.offset_deg is None else -heading.offset_deg
-    findings = {
-        "wheel_scale": _finding(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
-        "heading_offset_deg": _finding(offset, heading.offset_std_deg, -heading.applied_offset_deg),
-        "heading_delay_s": _finding(*delays.heading, delays.applied_heading_s),
-        "position_delay_s": _finding(*delays.gnss, delays.applied_gnss_s),
-        "position_delay_against_heading_s": _finding(
+    estimates = {
+        "wheel_scale": _estimate(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
+        "heading_offset_deg": _estimate(offset, heading.offset_std_deg, -heading.applied_offset_deg),
+        "heading_delay_s": _estimate(*delays.heading, delays.applied_heading_s),
+        "position_delay_s": _estimate(*delays.gnss, delays.applied_gnss_s),
+        "position_delay_against_heading_s": _estimate(
             *delays.apart, delays.applied_gnss_s - delays.applied_heading_s if not delays.together else 0.0
         ),
     }
     if streams.fit is None:
-        return findings
+        return estimates
     (right, left, x, multiplier, left_scale, right_scale), covariance = streams.fit.geometry()
     (forward_m, right_m), width = antenna_m, streams.fit.width_m
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     middle_std = math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)) / 2
     place = "only the position of the antenna relative to the ICRs is determined"
-    return findings | {
-        "left_scale": _finding(left_scale, std[4], streams.scales[0], nothing=1.0),
-        "right_scale": _finding(right_scale, std[5], streams.scales[1], nothing=1.0),
-        "icr_separation_m": Finding(width * multiplier, width * std[3], 0.0, NOT_A_CORRECTION),
-        "antenna_forward_minus_x_icr_m": Finding(-x, std[2], forward_m, place),
-        "antenna_right_minus_icr_middle_m": Finding(-(right + left) / 2, middle_std, right_m, place),
-        "y_icr_right_m": Finding(right + right_m, std[0], 0.0, NOT_A_CORRECTION),
-        "y_icr_left_m": Finding(left + right_m, std[1], 0.0, NOT_A_CORRECTION),
-        "x_icr_m": Finding(x + forward_m, std[2], 0.0, NOT_A_CORRECTION),
+    return estimates | {
+        "left_scale": _estimate(left_scale, std[4], streams.scales[0], nothing=1.0),
+        "right_scale": _estimate(right_scale, std[5], streams.scales[1], nothing=1.0),
+        "icr_separation_m": AlignmentEstimate(width * multiplier, width * std[3], 0.0, NOT_A_CORRECTION),
+        "antenna_forward_minus_x_icr_m": AlignmentEstimate(-x, std[2], forward_m, place),
+        "antenna_right_minus_icr_middle_m": AlignmentEstimate(-(right + left) / 2, middle_std, right_m, place),
+        "y_icr_right_m": AlignmentEstimate(right + right_m, std[0], 0.0, NOT_A_CORRECTION),
+        "y_icr_left_m": AlignmentEstimate(left + right_m, std[1], 0.0, NOT_A_CORRECTION),
+        "x_icr_m": AlignmentEstimate(x + forward_m, std[2], 0.0, NOT_A_CORRECTION),
     }
 
 
-def _finding(value: float | None, std: float | None, applied: float, nothing: float = 0.0) -> Finding:
-    """Return a finding about an estimate.
+def _estimate(value: float | None, std: float | None, applied: float, nothing: float = 0.0) -> AlignmentEstimate:
+    """Return an estimate with its correction.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def _finding(value: float | None, std: float | None, applied: float, nothing: fl
         why = "not corrected: too small, too uncertain, or not separable from wheel slip"
     else:
         why = "not corrected: this drive does not show it"
-    return Finding(value, std, applied, why)
+    return AlignmentEstimate(value, std, applied, why)
 
 
 LENGTH_M = 10.0

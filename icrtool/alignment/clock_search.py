@@ -13,7 +13,7 @@ from icrtool.alignment.log_track import IMPOSSIBLE_M
 from icrtool.alignment.wheel_units import LEAST_RESTART_RATIO
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Floats, Ints, trapezoids, unwrapped
-from icrtool.records.measurements import Finding
+from icrtool.records.measurements import AlignmentEstimate
 from icrtool.records.notes import Note, note
 from icrtool.records.samples import GyroAxes
 from icrtool.records.tables import RobotLog
@@ -149,19 +149,19 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
     return _moved(log, config, shifts["gnss"], shifts["heading"]), config, total
 
 
-def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Finding]:
-    """Return findings in which the delays of moved streams are relative to the stamps that were sent."""
+def with_shifts(estimates: dict[str, AlignmentEstimate], shifts: Shifts) -> dict[str, AlignmentEstimate]:
+    """Return estimates in which the delays of moved streams are relative to the stamps that were sent."""
     by = {
         "position_delay_s": shifts.gnss,
         "heading_delay_s": shifts.heading,
         "position_delay_against_heading_s": shifts.gnss - shifts.heading,
     }
 
-    def moved(finding: Finding, shift: float) -> Finding:
-        value = None if finding.value is None else finding.value + shift
-        return replace(finding, value=value, applied=finding.applied + shift, why="corrected") if shift else finding
+    def moved(estimate: AlignmentEstimate, shift: float) -> AlignmentEstimate:
+        value = None if estimate.value is None else estimate.value + shift
+        return replace(estimate, value=value, applied=estimate.applied + shift, why="corrected") if shift else estimate
 
-    return {name: moved(finding, by.get(name, 0.0)) for name, finding in findings.items()}
+    return {name: moved(estimate, by.get(name, 0.0)) for name, estimate in estimates.items()}
 
 
 def _sentence(word: str, shift_s: float, key: str) -> str:

@@ -65,7 +65,7 @@ CHORD_IN_POSITION_STD = 4.0
 """Smallest chord that is compared without a heading, in standard deviations of the position."""
 
 
-class Convention(NamedTuple):
+class StreamSigns(NamedTuple):
     """A hypothesis about sides and senses.
 
     Attributes
@@ -115,11 +115,11 @@ class Decision(NamedTuple):
     as_likely : another convention with the same likelihood and at most half a fault more; None without one
     """
 
-    convention: Convention
-    as_likely: Convention | None
+    convention: StreamSigns
+    as_likely: StreamSigns | None
 
 
-AS_NAMED = Convention(swapped=False, sign_left=1, sign_right=1, heading=1, position=1)
+AS_NAMED = StreamSigns(swapped=False, sign_left=1, sign_right=1, heading=1, position=1)
 """The convention in which sides, signs and senses are as their names state."""
 
 
@@ -160,9 +160,9 @@ def decide_conventions(
     scale = min(mad_std(convention.residuals, 0.0) for convention in fits.values())
     scale = max(scale, 0.5 * track.place_std_m / windows.length_m[0])
     losses = {hand: soft_l1_loss(convention.residuals / scale) / STARTS_A_WINDOW for hand, convention in fits.items()}
-    costs, offsets = dict[Convention, float](), dict[Convention, float]()
+    costs, offsets = dict[StreamSigns, float](), dict[StreamSigns, float]()
     headings, positions = (1, -1) if mirror_allowed else (1,), (1, -1) if metric else (1,)
-    for convention in map(Convention._make, product((False, True), (1, -1), (1, -1), headings, positions)):
+    for convention in map(StreamSigns._make, product((False, True), (1, -1), (1, -1), headings, positions)):
         hand = convention.heading * convention.position
         cost, offsets[convention] = _cost(convention, fits[hand])
         costs[convention] = cost + losses[hand]
@@ -212,7 +212,7 @@ class NamedFit(NamedTuple):
         return cls(fit.residuals, float(mad_std(fit.residuals, 0.0)), offset, float(fit.turn[0]) / std)
 
 
-def senses_by_distance(track: Track) -> Convention:
+def senses_by_distance(track: Track) -> StreamSigns:
     """Return the convention of a drive without a heading, by distances alone: whether one side counts backwards.
 
     Distances do not show which side it is; the side with which the robot then drives forward is chosen.
@@ -259,7 +259,7 @@ def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -
     return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group), place.residuals)
 
 
-def _cost(convention: Convention, fit: _Shown) -> tuple[float, float]:
+def _cost(convention: StreamSigns, fit: _Shown) -> tuple[float, float]:
     """Return the squared Mahalanobis distance of the fit from a convention's expected values, and its offset."""
     sides = np.diag([float(convention.sign_left), float(convention.sign_right)])
     if convention.swapped:
@@ -331,7 +331,7 @@ def gyro_sense(log: RobotLog, track: Track) -> int:
     return int(np.sign(line.scale)) if line.is_yaw else 0
 
 
-def apply_convention(log: RobotLog, convention: Convention) -> RobotLog:
+def apply_convention(log: RobotLog, convention: StreamSigns) -> RobotLog:
     """Return the log with sides, headings and positions corrected by a convention; the same log for `AS_NAMED`."""
     if convention == AS_NAMED:
         return log

@@ -63,7 +63,7 @@ A robot follows its wheels with a delay of up to `LONGEST_RESPONSE_S`, which is 
 deviation of a delay includes it. A small lead more often comes from such a response than from a clock."""
 
 
-class Delay(NamedTuple):
+class DelayEstimate(NamedTuple):
     """A delay with respect to the wheels and its standard deviation [s]; NaN where the drive does not show it."""
 
     value_s: float
@@ -75,7 +75,7 @@ class Delay(NamedTuple):
         return self.std_s < LARGEST_STD_S and abs(self.value_s) > CORRECTION_SIGMAS * self.std_s
 
 
-UNKNOWN = Delay(math.nan, math.nan)
+UNKNOWN = DelayEstimate(math.nan, math.nan)
 """A delay that was not measured."""
 
 
@@ -90,9 +90,9 @@ class StreamDelays(NamedTuple):
     applied_heading_s, applied_gnss_s : delays that are corrected [s]
     """
 
-    heading: Delay
-    gnss: Delay
-    apart: Delay
+    heading: DelayEstimate
+    gnss: DelayEstimate
+    apart: DelayEstimate
     together: bool
     applied_heading_s: float
     applied_gnss_s: float
@@ -120,9 +120,9 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tupl
     """Return the measured and the corrected delays of headings and positions, and findings about corrections."""
     heading = position = apart = UNKNOWN
     if fit is not None:
-        found = (Delay(*fit.estimate(name)) for name in ("heading_delay", "position_delay"))
+        found = (DelayEstimate(*fit.estimate(name)) for name in ("heading_delay", "position_delay"))
         heading, position = (delay if delay.std_s < 2 * LARGEST_STD_S else UNKNOWN for delay in found)
-        apart = Delay(*fit.estimate("position_after_heading"))
+        apart = DelayEstimate(*fit.estimate("position_after_heading"))
     together, notes, applied, lags = log.heading_is_of_position, list[Note](), (0.0, 0.0), [0.0, 0.0]
     if config.filter.rules.corrects:
         if fit is not None and not fit.slips:
@@ -135,7 +135,9 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tupl
     return StreamDelays(heading, position, apart, together, 0.0 if together else lags[0], lags[1]), notes
 
 
-def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> tuple[float, float]:
+def _clear_delays(
+    heading: DelayEstimate, position: DelayEstimate, apart: DelayEstimate, *, together: bool
+) -> tuple[float, float]:
     """Return the delays of heading and position to correct: the most likely combination.
 
     Twice the negative log-likelihood, with a penalty for each delay that is not zero (`CORRECTION_SIGMAS` squared).

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.conventions import Convention
+from icrtool.alignment.conventions import StreamSigns
 from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit
 from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS, STARTS_A_WINDOW, DriveWindows
@@ -214,7 +214,7 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
 
 
 def align_heading(
-    log: RobotLog, config: Config, fit: AlignmentFit | None, comparison: CourseComparison, convention: Convention,
+    log: RobotLog, config: Config, fit: AlignmentFit | None, comparison: CourseComparison, convention: StreamSigns,
     derived: DerivedHeading | None,
 ) -> tuple[HeadingFacts, float, list[Note]]:  # fmt: skip
     """Return the facts about the heading: its offset, its noise and its correction.
@@ -282,7 +282,7 @@ def _correction(
     log: RobotLog,
     config: Config,
     fit: AlignmentFit,
-    convention: Convention,
+    convention: StreamSigns,
     estimate: tuple[float, float],
     configured: float,
 ) -> tuple[float, OffsetCause, list[Note]]:

@@ -20,7 +20,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
 from icrtool.records import calibration_document as documents
-from icrtool.records.measurements import LONGEST_RESPONSE_S, Finding
+from icrtool.records.measurements import LONGEST_RESPONSE_S, AlignmentEstimate
 from icrtool.records.plain_data import finite_or_none
 from icrtool.records.run import Run
 
@@ -151,9 +151,9 @@ def _drive(run: Run) -> documents.SensorDrive:
     )
 
 
-def _numbers(finding: Finding | documents.SensorParameter) -> tuple[float, float]:
+def _numbers(estimate: AlignmentEstimate | documents.SensorParameter) -> tuple[float, float]:
     """Return an estimate and its standard deviation; NaN if the drive does not show them."""
-    return math.nan if finding.value is None else finding.value, math.nan if finding.std is None else finding.std
+    return math.nan if estimate.value is None else estimate.value, math.nan if estimate.std is None else estimate.std
 
 
 def _parameter(value: float, std: float, verdict: documents.SensorVerdict, note: str = "") -> documents.SensorParameter:

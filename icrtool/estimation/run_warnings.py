@@ -13,7 +13,7 @@ from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.run_filter import LARGEST_POSITION_MPS, NOISE_FACTOR
 from icrtool.kernels.arrays import Bytes, Floats
 from icrtool.kernels.filter_records import GATED, UNSEEN
-from icrtool.records.measurements import Finding, WheelFacts
+from icrtool.records.measurements import AlignmentEstimate, WheelFacts
 from icrtool.records.notes import Note, note, notes_about
 from icrtool.records.presets import ProcessNoise
 from icrtool.records.run import ICR_WORDS
@@ -71,7 +71,7 @@ def unusable_reasons(
     excitation: ExcitationDocument,
     rejected: Mapping[str, float],
     noise: ProcessNoise,
-    wheel_scale: Finding | None = None,
+    wheel_scale: AlignmentEstimate | None = None,
     twist_separation: tuple[float, float] | None = None,
     contradiction: str = "",
     filtered: str = "",
@@ -86,7 +86,7 @@ def unusable_reasons(
     excitation : ICRs that the drive shows
     rejected : `rejected_share` of the fixes, and of the headings
     noise : process noise of the pose
-    wheel_scale : finding about the scale of the wheels
+    wheel_scale : estimate of the scale of the wheels
     twist_separation : (y_r - y_l) / b by a body twist that was converted with b, and its standard deviation; None for
         other wheels
     contradiction : result of `contradicts_windows`
@@ -165,31 +165,32 @@ def _twist_reasons(separation: float, std: float) -> list[Note]:
     return [note("twist_holds_multiplier", why)]
 
 
-def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str, Finding]) -> str:
+def contradicts_windows(table: States, covariance: Floats, estimates: Mapping[str, AlignmentEstimate]) -> str:
     """Return how the final y ICRs contradict the ICRs from windows of the drive; empty if they agree.
 
     Parameters
     ----------
     table : the recorded states
     covariance : (3, 3) covariance of the final ICRs [m^2]
-    findings : findings of the alignment; without ICRs among them nothing is compared
+    estimates : estimates of the alignment; without ICRs among them nothing is compared
 
     Notes
     -----
     The filter uses single samples. The windows (`icrtool.alignment.estimator`) compare motion over metres and include
     delays. On recorded and simulated drives whose streams agree, both differ by up to 0.04 of the separation.
     """
-    right, left = findings.get("y_icr_right_m"), findings.get("y_icr_left_m")
+    right, left = estimates.get("y_icr_right_m"), estimates.get("y_icr_left_m")
     apart = []
-    for row, (word, finding) in enumerate((("right", right), ("left", left))):
-        if finding is None or finding.value is None or finding.std is None:
+    for row, (word, estimate) in enumerate((("right", right), ("left", left))):
+        if estimate is None or estimate.value is None or estimate.std is None:
             return ""
         final = float(table.icrs_at(-1)[row])
-        sigma = math.hypot(finding.std, math.sqrt(max(float(covariance[row, row]), 0.0)))
+        sigma = math.hypot(estimate.std, math.sqrt(max(float(covariance[row, row]), 0.0)))
         separation = abs(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
-        if abs(final - finding.value) > max(CONTRADICTION_SIGMAS * sigma, CONTRADICTION_SHARE * separation):
+        if abs(final - estimate.value) > max(CONTRADICTION_SIGMAS * sigma, CONTRADICTION_SHARE * separation):
             apart.append(
-                f"y {word} is {final:+z.2f} m by the filter and {finding.value:+z.2f} ± {finding.std:.2f} m by windows"
+                f"y {word} is {final:+z.2f} m by the filter and "
+                f"{estimate.value:+z.2f} ± {estimate.std:.2f} m by windows"
             )
     return f"wheels and reference contradict each other ({'; '.join(apart)}): clocks or slip" if apart else ""
 
@@ -220,7 +221,7 @@ def run_warnings(
     rejected: Mapping[str, float],
     multiplier: tuple[float, float] | None,
     excitation: ExcitationDocument,
-    findings: Mapping[str, Finding],
+    estimates: Mapping[str, AlignmentEstimate],
     *,
     inverted: bool,
 ) -> tuple[Note, ...]:
@@ -232,7 +233,7 @@ def run_warnings(
     rejected : `rejected_share` of the fixes, and of the headings
     multiplier : (y_r - y_l) / b and its standard deviation; None if b is not known, or the run is not usable
     excitation : ICRs that the drive shows
-    findings : findings of the alignment
+    estimates : estimates of the alignment
     inverted : the right ICR ended left of the left ICR
     """
     notes = list[Note]()
@@ -250,12 +251,12 @@ def run_warnings(
     delays = {"fixes": "position_delay_s", "headings": "heading_delay_s"}
     for word, share in rejected.items():
         if share > WORTH_WARNING_SHARE:
-            cause = _cause_of_rejection(findings.get(delays[word]))
+            cause = _cause_of_rejection(estimates.get(delays[word]))
             notes.append(note(REJECTED[word], f"{100 * share:.0f} % of the {word} were rejected: {cause}"))
     return notes_about(name, notes)
 
 
-def _cause_of_rejection(delay: Finding | None) -> str:
+def _cause_of_rejection(delay: AlignmentEstimate | None) -> str:
     """Return the possible cause of rejected measurements, from their delay against the wheels."""
     scatter = "they jump or scatter by more than they state"
     if delay is None or delay.value is None or delay.std is None:

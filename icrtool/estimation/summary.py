@@ -117,7 +117,7 @@ def summarise(
         streams=measurements.streams,
         notes=notes,
         warnings=warnings_of(notes),
-        alignment=measurements.findings,
+        alignment=measurements.estimates,
         drive=drive_summary(table, sensors.jumps, gaps),
         usable=not unusable,
         unusable_because=unusable_because(notes),
@@ -159,9 +159,9 @@ def _unusable_reasons(
     one_ground = not changes_s and wheels.ground_change_s is None
     contradiction = ""
     if corrects and one_ground:
-        contradiction = contradicts_windows(filtered.table, covariance, measurements.findings)
+        contradiction = contradicts_windows(filtered.table, covariance, measurements.estimates)
     return unusable_reasons(
-        excitation, rejected, filtered.noise, measurements.findings["wheel_scale"] if corrects else None,
+        excitation, rejected, filtered.noise, measurements.estimates["wheel_scale"] if corrects else None,
         multiplier if widths_from_twist else None, contradiction, wheels.filtered or "" if corrects else "", wheels,
         inverted=inverted,
     )  # fmt: skip
@@ -186,7 +186,7 @@ def _notes(
     end_s = float(table.t_s[-1])
     return (
         *measurements.notes,
-        *run_warnings(name, rejected, multiplier, excitation, measurements.findings, inverted=inverted),
+        *run_warnings(name, rejected, multiplier, excitation, measurements.estimates, inverted=inverted),
         *(
             []
             if filtered.sensors.facts.antenna_is_known or not excitation.verdict.shows_sides
@@ -212,7 +212,7 @@ def filter_summary(measurements: Measurements, filtered: Filtered, config: Confi
         preset=config.filter.preset,
         process_position_mps=filtered.noise.position_mps,
         process_heading_degps=filtered.noise.heading_degps,
-        reference_delay_s=measurements.findings["position_delay_s"].applied,
+        reference_delay_s=measurements.estimates["position_delay_s"].applied,
         states=len(filtered.table),
         warm_start=None
         if start is None
@@ -295,7 +295,7 @@ def _span_with_seconds(span: SlipEvent | ReferenceJump, table: States) -> dict[s
 
 def _heading_document(measurements: Measurements, filtered: Filtered) -> HeadingDocument:
     """Return the facts about the heading, its delay, and how many headings the filter used and rejected."""
-    lag = measurements.findings["heading_delay_s"]
+    lag = measurements.estimates["heading_delay_s"]
     return HeadingDocument(
         **asdict(measurements.heading), delay_s=lag.value, delay_std_s=lag.std, applied_delay_s=lag.applied,
         used=_count(filtered.heading.used), rejected=_count(filtered.heading.rejected),
@@ -369,7 +369,7 @@ def gnss_summary(
     measurements: Measurements,
 ) -> GnssDocument:  # fmt: skip
     """Return the numbers of used and rejected fixes, also by class, and the filter's distance from the used fixes."""
-    delay = measurements.findings["position_delay_s"]
+    delay = measurements.estimates["position_delay_s"]
     difference = outcome.difference[outcome.used & ~fixes.down_weighted]
     classes = {
         name: ClassDocument(

@@ -34,13 +34,13 @@ from icrtool.kernels.compiled import njit
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, euler_step
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
 
-Columns = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
+TrackColumns = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
 """Columns of a track of states: held, v_left, v_right, north, east, heading."""
 
 
 @njit
 def integrate_trials(
-    columns: Columns, icrs: FrozenIcrs, ends: Rows, lo: int, row_lo: int, row_hi: int, errors: Floats
+    columns: TrackColumns, icrs: FrozenIcrs, ends: Rows, lo: int, row_lo: int, row_hi: int, errors: Floats
 ) -> None:
     """Fill rows [row_lo, row_hi) of `errors` (n_horizons, n_starts): each path is integrated once for all horizons.
 
@@ -85,7 +85,7 @@ def integrate_trials(
                     errors[h, row] = math.sqrt(miss_north * miss_north + miss_east * miss_east)
 
 
-def compiled_columns(track: Track) -> Columns:
+def compiled_columns(track: Track) -> TrackColumns:
     """Return the columns of a track in the form that kernels are compiled for; only other forms are copied.
 
     Notes
@@ -226,7 +226,7 @@ class WheelSteps(NamedTuple):
     turn: Floats
 
 
-def wheel_steps(columns: Columns, first: int, last: int, turn: float) -> Iterator[WheelSteps]:
+def wheel_steps(columns: TrackColumns, first: int, last: int, turn: float) -> Iterator[WheelSteps]:
     """Yield the steps from state `first`, where D is `turn` [m], to state `last`, in chunks."""
     held, v_left, v_right, *_ = columns
     for lo in range(first, last, MAX_BLOCK):
@@ -237,7 +237,7 @@ def wheel_steps(columns: Columns, first: int, last: int, turn: float) -> Iterato
         turn = turns[-1]
 
 
-def plan_block(columns: Columns, icrs: FrozenIcrs, last: int, starts: slice) -> BlockPlan:
+def plan_block(columns: TrackColumns, icrs: FrozenIcrs, last: int, starts: slice) -> BlockPlan:
     """Return the plan for some starts and their `icrs`, whose trials end at state `last` or before.
 
     Notes
@@ -354,7 +354,7 @@ def fill_errors(
 
 
 def solve_block(
-    columns: Columns,
+    columns: TrackColumns,
     icrs: FrozenIcrs,
     plan: BlockPlan,
     ends: Rows,

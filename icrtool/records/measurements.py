@@ -1,4 +1,4 @@
-"""The measurements of a log after alignment: streams as the filter uses them, slip events, jumps, and the findings."""
+"""The measurements of a log after alignment: streams as the filter uses them, slip events, jumps, and the estimates."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class AlignmentEstimate:
     """One estimate of the alignment, and the correction that was made with it.
 
     Attributes
     ----------
     value, std : the estimate and its standard deviation; None where the drive does not show them. The name of the
-        finding ends with the unit
+        estimate ends with the unit
     applied : the correction that was made to the measurements, in the same unit
     why : why the correction was made, or why not
     """
@@ -288,18 +288,18 @@ class HeadingFacts(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """The aligned sensors of one log, and the findings of the alignment.
+    """The aligned sensors of one log, with the estimates and findings of the alignment.
 
     Attributes
     ----------
-    findings : estimates by name with unit; run.json has them as ``alignment``
+    estimates : estimates by name with unit; run.json has them as ``alignment``
     streams : the log's chosen topics; ``why`` also names the unit of the wheels
     wheels, heading : facts of wheels and heading, for run.json
     notes : findings, in the order they were made
     """
 
     sensors: SensorData
-    findings: dict[str, Finding]
+    estimates: dict[str, AlignmentEstimate]
     wheels: WheelFacts
     heading: HeadingFacts
     streams: tuple[StreamChoice, ...]

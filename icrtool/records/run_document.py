@@ -14,7 +14,7 @@ from msgspec import UNSET, UnsetType
 
 from icrtool.config import Config
 from icrtool.records.measurements import (
-    Finding,
+    AlignmentEstimate,
     HeadingFacts,
     IcrStart,
     LogFacts,
@@ -388,7 +388,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
     streams: tuple[StreamChoice, ...]
     notes: tuple[Note, ...]
     warnings: tuple[str, ...]
-    alignment: dict[str, Finding]
+    alignment: dict[str, AlignmentEstimate]
     drive: DriveDocument
     usable: bool
     unusable_because: str | None

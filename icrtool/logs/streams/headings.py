@@ -17,9 +17,9 @@ from icrtool.logs.streams.gyro_units import DEGREE, FASTEST_RADPS, LARGEST_BAD_S
 from icrtool.logs.streams.positions import GOAL_PROBLEM, GOAL_WORDS, is_fused
 from icrtool.logs.streams.sources import (
     Clock,
-    Convention,
     HeadingSource,
     StampedRows,
+    YawConvention,
     all_valid,
     fields_in,
     increasing_rows,
@@ -56,7 +56,7 @@ class Bearing:
     std: str = ""
     variance: str = ""
     valid: tuple[str, ...] = ()
-    convention: Convention = "ned"
+    convention: YawConvention = "ned"
     known_by: str = "degrees clockwise from north"
     independent: tuple[str, ...] = ()
 
@@ -241,7 +241,7 @@ ORDERS: tuple[tuple[tuple[int, int, int, int], str], ...] = (
 """Positions of x, y, z, w among the four fields in the orders that some drivers write, and text for the finding."""
 
 
-def frame_convention(table: TopicTable) -> tuple[Convention, str]:
+def frame_convention(table: TopicTable) -> tuple[YawConvention, str]:
     """Return the convention of the frame of a topic's messages, and a text about how it is known."""
     frame = table.text(FRAME_FIELD)
     if frame.lower().endswith("_ned") or frame.lower() == "ned":

@@ -72,7 +72,7 @@ class Joints:
         return replace(motion, notes=(*notes, *motion.notes))
 
 
-Columns = dict[Quantity, list[NDArray[Any]]]
+WheelColumns = dict[Quantity, list[NDArray[Any]]]
 """Positions and speeds (n,) of each wheel; an empty list for a quantity that is not recorded."""
 
 FEWEST_REPEATED = 5
@@ -89,11 +89,11 @@ quantile to come from a second publisher."""
 
 def _by_message(
     table: TopicTable, paths: Mapping[Quantity, str], places: Ints, alike: Bools
-) -> tuple[Columns, dict[str, Any], tuple[Note, ...]]:
+) -> tuple[WheelColumns, dict[str, Any], tuple[Note, ...]]:
     """Return the columns of messages that list both sides, the fields of a source for its topic, and findings."""
     if not alike.all():
         table, places = table.rows(alike), places[alike]
-    columns: Columns = {quantity: _by_wheel(table.find(path), places) for quantity, path in paths.items()}
+    columns: WheelColumns = {quantity: _by_wheel(table.find(path), places) for quantity, path in paths.items()}
     foreign = _of_second_publisher(columns["position"], columns["speed"])
     if foreign is None:
         return columns, topic_fields(table), ()
@@ -173,7 +173,7 @@ def _alternates(columns: Sequence[NDArray[Any]], repeated: Bools) -> bool:
 
 def _by_own_messages(
     table: TopicTable, paths: Mapping[Quantity, str], places: Ints
-) -> tuple[Columns, dict[str, Any], tuple[Note, ...]] | None:
+) -> tuple[WheelColumns, dict[str, Any], tuple[Note, ...]] | None:
     """Return the columns of wheels with a message for each wheel, at the stamps of the first wheel; as `_by_message`.
 
     Positions are interpolated, speeds are held. None is returned if the wheels were not recorded at the same time.
@@ -196,7 +196,7 @@ def _by_own_messages(
     if not both.any():
         return None
     moments = times[0][both]
-    columns: Columns = {"position": [], "speed": []}
+    columns: WheelColumns = {"position": [], "speed": []}
     for quantity, path in paths.items():
         values = table.find(path)
         for wheel, (rows_of_wheel, order) in enumerate(zip(rows, orders, strict=True)):

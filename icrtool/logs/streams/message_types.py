@@ -19,7 +19,7 @@ from icrtool.logs.streams.headings import Bearing, Orientation
 from icrtool.logs.streams.joints import Joints
 from icrtool.logs.streams.positions import Fix, Solution
 from icrtool.logs.streams.sources import Source
-from icrtool.logs.streams.wheels import FixedWheels, Odometry, Twist
+from icrtool.logs.streams.wheels import FixedWheels, OdometryTwist, Twist
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX, RTK_FIX, Role
 
 
@@ -222,7 +222,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         # The motor speed of this type is not used: it is a whole number of rpm before the gearbox.
         "scout_msgs/ScoutStatus": _AGILEX,
         "bunker_msgs/BunkerStatus": _AGILEX,
-        "nav_msgs/Odometry": Odometry("twist of the wheel odometry", 60.0, "twist.twist.", fused=50.0),
+        "nav_msgs/Odometry": OdometryTwist("twist of the wheel odometry", 60.0, "twist.twist.", fused=50.0),
         "geometry_msgs/TwistStamped": replace(_TWIST, path="twist."),
         "geometry_msgs/TwistWithCovarianceStamped": replace(_TWIST, path="twist.twist."),
         "geometry_msgs/Twist": replace(_TWIST, worth=40.0),

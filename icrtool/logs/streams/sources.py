@@ -300,7 +300,8 @@ class PositionSource(Source):
     stated_class: Bytes | None = None
 
 
-Convention = Literal["enu", "ned"]
+YawConvention = Literal["enu", "ned"]
+"""Convention of a yaw angle: counter-clockwise from east, or clockwise from north."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -317,10 +318,10 @@ class HeadingSource(Source):
 
     yaw_rad: Floats = field(default_factory=lambda: np.empty(0))
     variance: Floats = field(default_factory=lambda: np.empty(0))
-    convention: Convention = "enu"
+    convention: YawConvention = "enu"
     convention_why: str = ""
 
-    def heading_rad(self, convention: Convention) -> Floats:
+    def heading_rad(self, convention: YawConvention) -> Floats:
         """Return headings clockwise from north in (-pi, pi] (n,) [rad], if the angles have this convention."""
         heading = self.yaw_rad if convention == "ned" else math.pi / 2 - self.yaw_rad
         return np.pi - np.mod(np.pi - heading, 2 * np.pi)

@@ -312,7 +312,7 @@ POSE_PENALTY = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry(Twist):
+class OdometryTwist(Twist):
     """A message type with the velocity of the body, and with a pose by the wheels that is used if the velocity is 0."""
 
     @property

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventions, senses_by_distance
+from icrtool.alignment.conventions import AS_NAMED, StreamSigns, decide_conventions, senses_by_distance
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.log_track import cut_drive_windows, track_of_log
 from icrtool.kernels.track import Track
@@ -17,7 +17,7 @@ from icrtool.records.samples import GyroSamples
 from support.exact_drives import CONFIG, simulate
 
 
-def spoilt(track: Track, one: Convention) -> Track:
+def spoilt(track: Track, one: StreamSigns) -> Track:
     """Return the drive as a log would hold it whose convention is `one`."""
     left, right = (track.v_right, track.v_left) if one.swapped else (track.v_left, track.v_right)
     return track._replace(
@@ -28,7 +28,7 @@ def spoilt(track: Track, one: Convention) -> Track:
     )
 
 
-def equivalents(one: Convention) -> set[Convention]:
+def equivalents(one: StreamSigns) -> set[StreamSigns]:
     """Return the conventions that no residual tells from this one."""
     mirrored = one._replace(swapped=not one.swapped, heading=-one.heading, position=-one.position)
     return {
@@ -47,9 +47,9 @@ def track() -> Track:
 
 
 @pytest.mark.parametrize(
-    "one", [Convention(*parts) for parts in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1))]
+    "one", [StreamSigns(*parts) for parts in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1))]
 )
-def test_a_spoilt_log_is_recognised(track: Track, one: Convention) -> None:
+def test_a_spoilt_log_is_recognised(track: Track, one: StreamSigns) -> None:
     found = decide_conventions(cut_drive_windows(spoilt(track, one)), metric=True)
     assert found.convention in equivalents(one)
 
@@ -66,7 +66,7 @@ def test_a_spoilt_log_is_recognised(track: Track, one: Convention) -> None:
         AS_NAMED._replace(position=-1),
     ],
 )
-def test_a_single_fault_is_named_itself(track: Track, one: Convention) -> None:
+def test_a_single_fault_is_named_itself(track: Track, one: StreamSigns) -> None:
     found = decide_conventions(cut_drive_windows(spoilt(track, one)), metric=True, gyro_sense=one.heading)
     assert found.convention == one
 
@@ -119,5 +119,5 @@ def test_a_straight_drive_decides_nothing() -> None:
 
 
 @pytest.mark.parametrize("one", [AS_NAMED, AS_NAMED._replace(sign_left=-1), AS_NAMED._replace(sign_right=-1)])
-def test_a_reversed_side_shows_without_a_heading(track: Track, one: Convention) -> None:
+def test_a_reversed_side_shows_without_a_heading(track: Track, one: StreamSigns) -> None:
     assert senses_by_distance(spoilt(track, one)) == one

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.conventions import AS_NAMED, decide_conventions
-from icrtool.alignment.corrections import Delay, StreamDelays, _clear_delays
+from icrtool.alignment.corrections import DelayEstimate, StreamDelays, _clear_delays
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import cut_drive_windows, track_of_log
 from icrtool.config import load_config
@@ -174,19 +174,21 @@ def test_a_stamp_decades_away_neither_fills_the_memory_nor_changes_the_delay(row
     ],
 )
 def test_the_likeliest_delays_are_corrected(heading: float, after: float, expected: tuple[float, float]) -> None:
-    found = _clear_delays(Delay(heading, 0.03), Delay(heading + after, 0.06), Delay(after, 0.05), together=False)
+    found = _clear_delays(
+        DelayEstimate(heading, 0.03), DelayEstimate(heading + after, 0.06), DelayEstimate(after, 0.05), together=False
+    )
     assert found == pytest.approx(expected)
 
 
 def test_clocks_that_show_no_difference_are_known_better_than_the_drive_shows() -> None:
-    nothing = Delay(0.0, 0.03)
+    nothing = DelayEstimate(0.0, 0.03)
 
     def unknown(after: float, std: float) -> float:
-        return StreamDelays(nothing, nothing, Delay(after, std), False, 0.0, 0.0).clock_std_s
+        return StreamDelays(nothing, nothing, DelayEstimate(after, std), False, 0.0, 0.0).clock_std_s
 
     assert unknown(0.0, 0.05) == pytest.approx(0.05 / 2.0)
     assert unknown(0.12, 0.05) > 0.1
     # a drive that shows nothing leaves half of the prior
     assert unknown(0.0, 0.15) == pytest.approx(0.15 / np.sqrt(2.0))
-    corrected = StreamDelays(nothing, nothing, Delay(0.2, 0.05), False, 0.0, 0.2)
+    corrected = StreamDelays(nothing, nothing, DelayEstimate(0.2, 0.05), False, 0.0, 0.2)
     assert corrected.clock_std_s == 0.05

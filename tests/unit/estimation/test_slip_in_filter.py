@@ -125,6 +125,6 @@ def test_an_event_is_left_out_of_the_alignment(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("icrtool.alignment.align.find_disagreements", lambda sensors, width_m: Disagreements())
     once = align(log, CONFIG)
     true = ICRS[0] - ICRS[1]
-    errors = [abs((one.findings["icr_separation_m"].value or 0.0) - true) for one in (found, once)]
+    errors = [abs((one.estimates["icr_separation_m"].value or 0.0) - true) for one in (found, once)]
     assert errors[0] < 0.01 * true
     assert errors[1] > 3.0 * errors[0]
