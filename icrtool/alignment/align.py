@@ -235,13 +235,13 @@ def alignment_estimates(streams: AlignedStreams, antenna_m: tuple[float, float])
     (forward_m, right_m), width = antenna_m, streams.fit.width_m
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     middle_std = math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)) / 2
-    place = "only the position of the antenna relative to the ICRs is determined"
+    reason = "only the position of the antenna relative to the ICRs is determined"
     return estimates | {
         "left_scale": _estimate(left_scale, std[4], streams.scales[0], nothing=1.0),
         "right_scale": _estimate(right_scale, std[5], streams.scales[1], nothing=1.0),
         "icr_separation_m": AlignmentEstimate(width * multiplier, width * std[3], 0.0, NOT_A_CORRECTION),
-        "antenna_forward_minus_x_icr_m": AlignmentEstimate(-x, std[2], forward_m, place),
-        "antenna_right_minus_icr_middle_m": AlignmentEstimate(-(right + left) / 2, middle_std, right_m, place),
+        "antenna_forward_minus_x_icr_m": AlignmentEstimate(-x, std[2], forward_m, reason),
+        "antenna_right_minus_icr_middle_m": AlignmentEstimate(-(right + left) / 2, middle_std, right_m, reason),
         "y_icr_right_m": AlignmentEstimate(right + right_m, std[0], 0.0, NOT_A_CORRECTION),
         "y_icr_left_m": AlignmentEstimate(left + right_m, std[1], 0.0, NOT_A_CORRECTION),
         "x_icr_m": AlignmentEstimate(x + forward_m, std[2], 0.0, NOT_A_CORRECTION),

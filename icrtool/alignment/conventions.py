@@ -248,15 +248,16 @@ def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -
     first, last = windows.turn_begin, windows.turn_end
     turns = [track.cumulate(speed) for speed in (track.half_difference, track.mean_speed)]
     by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in turns]
-    place, turn = (
+    displacement_fit, turn_fit = (
         robust_regression(design, target, np.full(design.shape[1], VAGUE_PRIOR_STD), float(STARTS_A_WINDOW))
         for design, target in (
             (np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])),
             (np.column_stack(by), hand * windows.heading_changes),
         )
     )
-    of_place = sandwich_covariance(place, np.tile(windows.group, 2))
-    return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group), place.residuals)
+    covariance = sandwich_covariance(displacement_fit, np.tile(windows.group, 2))
+    turn_covariance = sandwich_covariance(turn_fit, windows.turn_group)
+    return _Shown(displacement_fit.x, covariance, turn_fit.x, turn_covariance, displacement_fit.residuals)
 
 
 def _cost(convention: StreamSigns, fit: _Shown) -> tuple[float, float]:

@@ -229,9 +229,9 @@ class AlignedStreams(NamedTuple):
         if self.fit is None:
             none = np.empty(0, np.complex128)
             return measure_steps(track.place_t, track.place, track.laid), measure_steps(np.empty(0), none, none)
-        place, turn = self.fit.model.until_fixes(self.fit.solution.x)
+        moved, turn = self.fit.model.until_fixes(self.fit.solution.x)
         turned = track.heading_at(track.place_t)
-        return measure_steps(track.place_t, track.place, place), measure_steps(track.place_t, turned, turn)
+        return measure_steps(track.place_t, track.place, moved), measure_steps(track.place_t, turned, turn)
 
 
 def align_streams(log: RobotLog, config: Config) -> AlignedStreams:

@@ -110,16 +110,18 @@ def find_changes(fit: AlignmentFit) -> GroundChanges | None:
     weight = np.cumsum(turns.x**2)
     if not len(turns.x) or weight[-1] <= 0.0:
         return None
-    places = np.unique(np.searchsorted(weight, np.linspace(0.0, 1.0, CHANGE_CANDIDATES + 2) * weight[-1]))
-    places = np.unique(np.concatenate([[0], places[(places > 0) & (places < len(turns.x))], [len(turns.x)]]))
-    ways, costs = _best_partitions(turns, places)
+    candidates = np.unique(np.searchsorted(weight, np.linspace(0.0, 1.0, CHANGE_CANDIDATES + 2) * weight[-1]))
+    candidates = np.unique(
+        np.concatenate([[0], candidates[(candidates > 0) & (candidates < len(turns.x))], [len(turns.x)]])
+    )
+    ways, costs = _best_partitions(turns, candidates)
     likelihood = [len(turns.x) / 2 * math.log(max(cost, 1e-12)) for cost in costs]
     # The most likely number of changes comes first, then less likely ones, until all stretches show their ratio.
     ranked = sorted(range(len(ways)), key=lambda count: likelihood[count] + CHANGE_GAIN * count)
     for count in ranked:
         if count == 0:
             return None
-        stretches = _stretches(turns, _refined(turns, ways[count], places))
+        stretches = _stretches(turns, _refined(turns, ways[count], candidates))
         if stretches is not None:
             return GroundChanges(stretches)
     return None
@@ -133,11 +135,11 @@ def find_exchange(fit: AlignmentFit) -> float | None:
     turns = _turns(fit)
     if turns is None or not np.any(turns.x):
         return None
-    places = np.unique(np.linspace(0, len(turns.x), CHANGE_CANDIDATES + 2).astype(np.int64))
-    ways, _ = _best_partitions(turns, places)
+    candidates = np.unique(np.linspace(0, len(turns.x), CHANGE_CANDIDATES + 2).astype(np.int64))
+    ways, _ = _best_partitions(turns, candidates)
     if len(ways) < 2:
         return None
-    rows = _refined(turns, ways[1], places)
+    rows = _refined(turns, ways[1], candidates)
     before, after = (_ratio(turns.rows(first, stop)) for first, stop in pairwise(rows))
     if before is None or after is None or before[0] * after[0] >= 0.0:
         return None
@@ -165,23 +167,23 @@ def _turns(fit: AlignmentFit) -> _Turns | None:
     return _Turns(begin, x, y, np.floor(begin / CHANGE_GROUP_S).astype(np.int64))
 
 
-def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list[float]]:
+def _best_partitions(turns: _Turns, candidates: Ints) -> tuple[list[list[int]], list[float]]:
     """Return the rows that divide the windows, both ends included, and the sum of squares, by number of changes.
 
     Parameters
     ----------
-    places : (p,) rows at which a stretch may begin or end, ascending
+    candidates : (p,) rows at which a stretch may begin or end, ascending
     """
-    sums = [np.append(0.0, np.cumsum(products))[places] for products in (turns.x**2, turns.x * turns.y, turns.y**2)]
+    sums = [np.append(0.0, np.cumsum(products))[candidates] for products in (turns.x**2, turns.x * turns.y, turns.y**2)]
     groups = np.searchsorted(np.unique(turns.group), turns.group)
-    enough = np.append(groups, groups[-1] + 1)[places]
+    enough = np.append(groups, groups[-1] + 1)[candidates]
 
     def remaining(first: Ints, stop: int) -> Floats:
         xx, xy, yy = (total[stop] - total[first] for total in sums)
         short = (enough[stop] - enough[first] < FEWEST_CHANGE_GROUPS) | (xx <= 0.0)
         return np.where(short, np.inf, np.maximum(yy - xy**2 / np.where(xx > 0.0, xx, 1.0), 0.0))
 
-    count = len(places)
+    count = len(candidates)
     best = np.array([np.inf, *(float(remaining(np.array([0]), stop)[0]) for stop in range(1, count))])
     best_before, ways, costs = list[Ints](), list[list[int]](), list[float]()
     for changes in range(MOST_CHANGES + 1):
@@ -195,12 +197,12 @@ def _best_partitions(turns: _Turns, places: Ints) -> tuple[list[list[int]], list
         for best_first in reversed(best_before):
             at = int(best_first[at])
             rows.append(at)
-        ways.append([0, *(int(places[row]) for row in reversed(rows))])
+        ways.append([0, *(int(candidates[row]) for row in reversed(rows))])
         costs.append(float(best[-1]))
     return ways, costs
 
 
-def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
+def _refined(turns: _Turns, rows: list[int], candidates: Ints) -> list[int]:
     """Return rows that divide the windows, each moved to the smallest sum of squares between its neighbours."""
     xx, xy, yy = (np.append(0.0, np.cumsum(products)) for products in (turns.x**2, turns.x * turns.y, turns.y**2))
 
@@ -210,8 +212,8 @@ def _refined(turns: _Turns, rows: list[int], places: Ints) -> list[int]:
 
     refined = list(rows)
     for i in range(1, len(rows) - 1):
-        at = int(np.searchsorted(places, rows[i]))
-        tried = np.arange(max(int(places[at - 1]), refined[i - 1]) + 1, min(int(places[at + 1]), rows[i + 1]))
+        at = int(np.searchsorted(candidates, rows[i]))
+        tried = np.arange(max(int(candidates[at - 1]), refined[i - 1]) + 1, min(int(candidates[at + 1]), rows[i + 1]))
         refined[i] = int(tried[np.argmin(remaining(refined[i - 1], tried) + remaining(tried, rows[i + 1]))])
     return refined
 

@@ -116,13 +116,13 @@ class Motion(NamedTuple):
 
     Attributes
     ----------
-    place : complex (m,) displacement since the first knot, north + j east [m]
+    displacement : complex (m,) displacement since the first knot, north + j east [m]
     turn : (m,) turn since the first knot, clockwise [rad]
     scale : distance of the robot per distance that the wheels report
     lever_m : half the ICR separation [m]; a turn times this lever is a distance
     """
 
-    place: Complexes
+    displacement: Complexes
     turn: Floats
     scale: float
     lever_m: float
@@ -266,9 +266,9 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     fit = estimate_alignment(windows, width_m)
     if fit is None:
         return None
-    place, turn = fit.model.until_fixes(fit.solution.x)
+    displacement, turn = fit.model.until_fixes(fit.solution.x)
     gain = max(abs(fit.estimate("turn")[0]), LEAST_TURN_GAIN)
-    return Motion(place, turn, abs(fit.estimate("scale")[0]), width_m / 2 / gain)
+    return Motion(displacement, turn, abs(fit.estimate("scale")[0]), width_m / 2 / gain)
 
 
 def compare_with_wheels(
@@ -284,11 +284,11 @@ def compare_with_wheels(
     response_std_s : standard deviation of the time by which the robot lags its wheels [s]
     """
     level = np.exp(-0.5j * (knots.heading[first] + knots.heading[last]))
-    place, model, change = (
-        level * (column[last] - column[first]) for column in (knots.track.place, motion.place, knots.velocity)
+    moved, model, change = (
+        level * (column[last] - column[first]) for column in (knots.track.place, motion.displacement, knots.velocity)
     )
     turn, model_turn, spin = (column[last] - column[first] for column in (knots.heading, motion.turn, knots.apart))
-    missed, path_m, lever = place - model, knots.track.distance[last] - knots.track.distance[first], motion.lever_m
+    missed, path_m, lever = moved - model, knots.track.distance[last] - knots.track.distance[first], motion.lever_m
     scale2 = motion.scale**2
     noise = knots.variance[first] + knots.variance[last]
     held = scale2 * (knots.held_m2[last] - knots.held_m2[first]) / 2
@@ -296,7 +296,7 @@ def compare_with_wheels(
     turn_noise = lever**2 * 2 * knots.turn_variance
     return ComparedWindows(
         first, last, missed.real, missed.imag, lever * (turn - model_turn), model.real, lever * model_turn,
-        np.maximum(np.abs(place), lever * np.abs(turn)), motion.scale * path_m,
+        np.maximum(np.abs(moved), lever * np.abs(turn)), motion.scale * path_m,
         np.column_stack([noise + held + ahead, noise + held / 4 + ahead / 4, turn_noise + held + spun]),
     )  # fmt: skip
 

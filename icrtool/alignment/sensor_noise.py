@@ -102,16 +102,16 @@ class FixSteps(NamedTuple):
         return level, np.asarray(moves.mean(axis=1) > 0.5)
 
 
-def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Complexes) -> FixSteps:
+def measure_steps(t: Floats, position: Floats | Complexes, expected: Floats | Complexes) -> FixSteps:
     """Return the steps between fixes minus the motion of the wheels.
 
     Parameters
     ----------
     t : (m,) stamps of the fixes [s]
-    place : complex (m,) positions of the fixes, north + j east [m]; or float64 (m,) headings [rad]
+    position : complex (m,) positions of the fixes, north + j east [m]; or float64 (m,) headings [rad]
     expected : (m,) positions or headings by the wheels alone, as integrals, in the same unit
     """
-    step, dt = np.diff(place - expected).astype(np.complex128), np.diff(t)
+    step, dt = np.diff(position - expected).astype(np.complex128), np.diff(t)
     if len(step) < 2:
         unknown = np.full(max(len(step) - 1, 0), np.nan)
         return FixSteps(step, unknown, np.zeros(len(step), np.bool_), np.empty(0, np.int64))
@@ -270,12 +270,14 @@ def _variance(
     return np.maximum(np.where(sane, stated, usual**2), max(floor, at_least) ** 2)
 
 
-def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn: FixSteps) -> tuple[float, float]:
+def reference_noise(
+    log: RobotLog, settings: FilterConfig, position_steps: FixSteps, turn_steps: FixSteps
+) -> tuple[float, float]:
     """Return the measured noise of a reference's positions on one axis [m] and of its headings [rad]; NaN: as stated.
 
     Parameters
     ----------
-    place, turn : steps of the positions and of the headings against the wheels
+    position_steps, turn_steps : steps of the positions and of the headings against the wheels
 
     Notes
     -----
@@ -290,12 +292,12 @@ def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn
     if not free or place_stated:
         return math.nan, math.nan
     values = np.concatenate([log.gnss.north_m, log.gnss.east_m])
-    std_m = _measured(place, values, LEAST_POSITION_STD_M, USUAL_POSITION_STD_M)
+    std_m = _measured(position_steps, values, LEAST_POSITION_STD_M, USUAL_POSITION_STD_M)
     if math.isnan(std_m) or not log.heading_is_of_position or turn_stated or settings.heading_std_deg != "auto":
         return std_m, math.nan
     # A heading has one axis, but `white_std_m` divides the variance among two axes.
     least, usual = (angle / math.sqrt(2.0) for angle in (LEAST_HEADING_STD_RAD, math.radians(USUAL_HEADING_STD_DEG)))
-    return std_m, math.sqrt(2.0) * _measured(turn, log.heading.heading_rad, least, usual)
+    return std_m, math.sqrt(2.0) * _measured(turn_steps, log.heading.heading_rad, least, usual)
 
 
 def _measured(steps: FixSteps, values: Floats, least: float, usual: float) -> float:

@@ -287,8 +287,8 @@ def _returns(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
     middle = (knots.heading[1:] + knots.heading[:-1]) / 2
     low, high = np.searchsorted(knots.t, [extent.begin_s - RETURN_S, extent.end_s + RETURN_S])
     rows = np.arange(max(int(low), 0), min(int(high), len(steps.begin)))
-    place = (steps.ahead[rows] + 1j * steps.aside[rows]) * np.exp(1j * middle[rows])
-    step = np.column_stack([place.real, place.imag, steps.turned[rows]])
+    displacement = (steps.ahead[rows] + 1j * steps.aside[rows]) * np.exp(1j * middle[rows])
+    step = np.column_stack([displacement.real, displacement.imag, steps.turned[rows]])
     missed = step[(rows >= extent.first) & (rows < extent.last)].sum(axis=0)
     square = float(missed @ missed)
     if square < RETURN_SIGMAS**2 * float(knots.variance[extent.first] + knots.variance[extent.last]):

@@ -95,12 +95,12 @@ class WheelPath(NamedTuple):
 
     Attributes
     ----------
-    place : (m,) by the wheels, in their unit, with an unknown direction
+    position : (m,) by the wheels, in their unit, with an unknown direction
     noise_m : of the fixes on one axis [m], beyond the path and slip
     misfit : median distance of a fix from the place that the two fixes before it and the path give, over the step
     """
 
-    place: Complexes
+    position: Complexes
     noise_m: float
     misfit: float
 
@@ -133,8 +133,8 @@ def wheel_path(track: Track) -> WheelPath | None:
         if not math.isfinite(largest):
             return None
         for ratio in (metres * _ratios(largest)).tolist():
-            place = np.asarray(track.at_places(ahead * np.exp(1j * ratio * middle)), np.complex128)
-            gain, away = _third_fixes(place, track.place, usable)
+            position = np.asarray(track.at_places(ahead * np.exp(1j * ratio * middle)), np.complex128)
+            gain, away = _third_fixes(position, track.place, usable)
             misfit = float(np.median(np.abs(away) / (1.0 + np.abs(gain))))
             if misfit < least:
                 turns = 1.0 + abs(ratio) * (turned[1:] + turned[:-1])
@@ -142,7 +142,7 @@ def wheel_path(track: Track) -> WheelPath | None:
                 # the variance of p_3 - p_2 - gain (p_2 - p_1) by white noise, in variances of a fix
                 spread = np.sqrt(1.0 + np.abs(1.0 + gain) ** 2 + np.abs(gain) ** 2)
                 beyond = np.sqrt(np.maximum(np.abs(away) ** 2 - slip_m**2, 0.0)) / spread
-                least, best = misfit, (place, float(np.median(beyond)) / MEDIAN_OF_RAYLEIGH)
+                least, best = misfit, (position, float(np.median(beyond)) / MEDIAN_OF_RAYLEIGH)
     return None if best is None else WheelPath(*best, least / max(float(np.median(np.abs(seen[moves]))), 1e-9))
 
 
@@ -156,16 +156,16 @@ def _averaged_wheels(track: Track) -> Track:
     return track.joined(np.flatnonzero(begins))
 
 
-def _third_fixes(path: Complexes, place: Complexes, usable: Bools) -> tuple[Complexes, Complexes]:
+def _third_fixes(path: Complexes, position: Complexes, usable: Bools) -> tuple[Complexes, Complexes]:
     """Return the ratio of the second step to the first by a path, and how far the third fix lies from its place [m].
 
     Parameters
     ----------
-    path, place : (m,) by the wheels and by the fixes; usable : (m - 2,) triples that are returned
+    path, position : (m,) by the wheels and by the fixes; usable : (m - 2,) triples that are returned
     """
     first, second = np.diff(path)[:-1][usable], np.diff(path)[1:][usable]
     gain = second / np.where(np.abs(first) > 0.0, first, np.inf)
-    return gain, np.diff(place)[1:][usable] - gain * np.diff(place)[:-1][usable]
+    return gain, np.diff(position)[1:][usable] - gain * np.diff(position)[:-1][usable]
 
 
 def _ratios(largest_m: float) -> Floats:
@@ -217,8 +217,8 @@ def without_interpolated(log: RobotLog) -> RobotLog:
     if not in_order or not all((np.abs(column) < LARGEST_STATE).all() for column in columns):
         # Damaged streams are refused later, with the reason.
         return log
-    t, place = (stamps - stamps[0]) / 1e9, fixes.north_m + 1j * fixes.east_m
-    bend, step = _bends(t, place)
+    t, position = (stamps - stamps[0]) / 1e9, fixes.north_m + 1j * fixes.east_m
+    bend, step = _bends(t, position)
     straight = bend <= LINE_SHARE * step + LINE_M
     row = np.clip(np.searchsorted(wheels.stamp_ns, stamps, side="right") - 1, 0, len(wheels.stamp_ns) - 1)
     left, right = wheels.left[row], wheels.right[row]

@@ -153,7 +153,7 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     nose = unit * track.held
     step = (v + guess.middle * u) * nose
     span = max(track.t[0], turn.t[0]), min(track.t[-1], turn.t[-1])
-    length, t, place, begin, end = _cut_courses(track._replace(place_t=track.place_t - guess.delay_s), *span)
+    length, t, position, begin, end = _cut_courses(track._replace(place_t=track.place_t - guess.delay_s), *span)
     if not len(begin):
         return Courses(*(np.empty(0) for _ in Courses._fields))
     count, used = end + 1 - begin, slice(0, end[-1] + 1)
@@ -176,7 +176,7 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     path = centred(laid_path - guess.x * swing)
     speed = v[np.clip(np.searchsorted(track.t, t, side="right") - 1, 0, len(v) - 1)]
     square = np.maximum(product(path).real, 1e-12)
-    displacement = product(centred(place)) / square
+    displacement = product(centred(position)) / square
     unknown = guess.bias_std * (t[end] - t[begin]) + guess.scale_std * np.abs(turned[end] - turned[begin])
     usable = (unknown < LARGEST_TURN_ERROR_RAD) & (np.abs(displacement) > 0.3)
     usable &= np.abs(laid_path[end] - laid_path[begin]) > 0.5 * length * (count - 1) / count
@@ -246,9 +246,9 @@ def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
     over ground between them, clockwise [rad]
     """
     along = track.cumulate(track.mean_speed)
-    length, t, place, begin, end = _cut_courses(track, float(track.t[0]), float(track.t[-1]))
+    length, t, position, begin, end = _cut_courses(track, float(track.t[0]), float(track.t[-1]))
     went = np.interp(t[end], track.t, along) - np.interp(t[begin], track.t, along)
-    displacement = (place[end] - place[begin]) * np.sign(went)
+    displacement = (position[end] - position[begin]) * np.sign(went)
     usable = (np.abs(went) > 0.3 * length) & (np.abs(displacement) > 0.3 * np.abs(went))
     usable &= t[end] - t[begin] < LONGEST_STRETCH_S
     middle, displacement = ((t[begin] + t[end]) / 2)[usable], displacement[usable]
@@ -261,32 +261,32 @@ def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Fl
 
     Returns
     -------
-    length of the windows [m]; times and places of the fixes, without fixes that lie far from both neighbours; rows of
-    these (w,), first and last of each window
+    length of the windows [m]; times and positions of the fixes, without fixes that lie far from both neighbours; rows
+    of these (w,), first and last of each window
     """
     std = min(track.place_std_m, 10.0)
     short = max(float(track.travel[-1]) / ENOUGH_COURSES, SHORTEST_IN_POSITION_STD * std)
     length = max(COURSE_WINDOW_M, min(COURSE_IN_POSITION_STD * std, short))
     rows = np.flatnonzero((track.place_t >= first_s) & (track.place_t <= last_s))
-    t, place = track.place_t[rows], track.place[rows]
+    t, position = track.place_t[rows], track.place[rows]
     if len(rows) > 2:
-        bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
+        bend = np.abs(position[1:-1] - (position[:-2] + position[2:]) / 2)
         far = bend > JUMP_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
         # A spike also bends the path at its two neighbours, by half of the angle.
         spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
         kept = np.concatenate([[True], ~spike, [True]])
-        t, place = t[kept], place[kept]
+        t, position = t[kept], position[kept]
     gone = np.interp(t, track.t, track.cumulate(np.abs(track.mean_speed)))
     step = np.diff(gone)
     if FIXES_A_WINDOW * float(np.median(step[step > 0.0] if (step > 0.0).any() else 0.0)) > LONG_WINDOW * length:
         rows, begin, end = _windows_of_rare(gone, length)
-        return length, t[rows], place[rows], begin, end
+        return length, t[rows], position[rows], begin, end
     cell = np.floor(gone / length)
     edges = [0]
     for row in (np.flatnonzero(np.diff(cell) > 0) + 1).tolist():
         if row - edges[-1] >= FIXES_A_WINDOW:
             edges.append(row)
-    return length, t, place, np.array(edges[:-1], np.int64), np.array(edges[1:], np.int64) - 1
+    return length, t, position, np.array(edges[:-1], np.int64), np.array(edges[1:], np.int64) - 1
 
 
 def _windows_of_rare(gone_m: Floats, length_m: float) -> tuple[Ints, Ints, Ints]:

@@ -260,8 +260,8 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
         or np.mean((log.wheels.left != 0.0) | (log.wheels.right != 0.0)) < LEAST_TURNING_SHARE
     ):
         return
-    place = log.gnss.north_m + 1j * log.gnss.east_m
-    away = np.abs(place - (np.median(place.real) + 1j * np.median(place.imag)))
+    position = log.gnss.north_m + 1j * log.gnss.east_m
+    away = np.abs(position - (np.median(position.real) + 1j * np.median(position.imag)))
     reach_m = float(np.percentile(away, 95))
     variance = (log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2
     stated_variance = variance[np.isfinite(variance)]
@@ -330,7 +330,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     straight = usable & (turn < LARGEST_STRAIGHT_DIFFERENCE * distance)
     path = wheel_path(track) if usual_s > CHORD_S else None
     if path is not None and path.misfit < WELL_FITTED:
-        by_path = np.abs(np.diff(path.place[rows_of_chords(track)]))
+        by_path = np.abs(np.diff(path.position[rows_of_chords(track)]))
         straight = usable & (by_path > distance / 2)
         distance = by_path
     elif np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:

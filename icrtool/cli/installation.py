@@ -89,16 +89,16 @@ def compile_all(*, quiet: bool) -> None:
     """  # noqa: D301 - click reads the escape
     import icrtool
     from icrtool.errors import OutputError
-    from icrtool.kernels.compiled import all_kernels, cache_places, processor, writable_place
+    from icrtool.kernels.compiled import all_kernels, cache_directories, processor, writable_directory
 
     begin = time.perf_counter()
     for module in pkgutil.walk_packages(icrtool.__path__, "icrtool."):
         # Python keeps the compiled code of an imported module.
         importlib.import_module(module.name)
-    place = writable_place()
+    place = writable_directory()
     if place is None:
         raise OutputError(
-            cache_places()[0], "cannot be written", "set NUMBA_CACHE_DIR to a directory that can be written"
+            cache_directories()[0], "cannot be written", "set NUMBA_CACHE_DIR to a directory that can be written"
         )
     call_all_kernels()
     if not quiet:

@@ -1,4 +1,4 @@
-"""The decorator of compiled kernels, and the place of their machine code.
+"""The decorator of compiled kernels, and the directory of their machine code.
 
 numba compiles a kernel when it is first called on a computer. The object file is kept, and later processes run it by
 llvmlite, the library below numba, because the import of numba takes longer than all other imports of a command: 0.6 s
@@ -126,7 +126,7 @@ _OBJECT_MAGICS = (b"\x7fELF", b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
 
 
 _ELF_SECTIONS = struct.Struct("<40xQ10xHHH")
-"""Layout of the header of an ELF file (64 bits): place of the table of sections, size of an entry, number of
+"""Layout of the header of an ELF file (64 bits): offset of the table of sections, size of an entry, number of
 entries."""
 
 
@@ -140,11 +140,11 @@ def _is_object(content: bytes) -> bool:
     return _ELF_SECTIONS.size <= at and at + size * count <= len(content) and size == 64 and names < count
 
 
-def _is_own(place: Path) -> bool:
+def _is_own(directory: Path) -> bool:
     """Return whether no other user can write a file or folder, because machine code in it is executed."""
     if not hasattr(os, "geteuid"):
         return True
-    status = place.stat()
+    status = directory.stat()
     return status.st_uid in (0, os.geteuid()) and not status.st_mode & stat.S_IWOTH
 
 
@@ -232,8 +232,8 @@ class Kernel:
         """Return a function that runs machine code, kept or compiled now; None if only numba can run it."""
         name = f"{self.py_func.__module__.rpartition('.')[2]}.{self.py_func.__qualname__}"
         file = f"{name}-{hashlib.sha256(repr((_stamp(), types)).encode()).hexdigest()[:24]}.o"
-        for place in cache_places() if _stamp() else ():
-            if kept := MachineCode.read(place / file):
+        for directory in cache_directories() if _stamp() else ():
+            if kept := MachineCode.read(directory / file):
                 return _loaded(kept, arguments.forms)
         self.compiled += 1
         for watch in _watchers:
@@ -354,18 +354,18 @@ def _gives_the_same(function: Callable[..., Any], *given: object) -> bool:
 
 
 def _plain_njit(function: Callable[..., Any]) -> Callable[..., Result]:
-    """Return a function as ``numba.njit(cache=True)`` makes it; without the cache if no place can be written.
+    """Return a function as ``numba.njit(cache=True)`` makes it; without the cache if no directory can be written.
 
     Numba compares only the file of the function to find a change. Therefore the name of the folder depends on the
     sources of all kernels.
     """
-    numba, place, stamp = _numba(), writable_place(), _stamp()
+    numba, directory, stamp = _numba(), writable_directory(), _stamp()
     _mark_parts()
-    if place is not None and stamp:
-        folder = place / f"numba-{hashlib.sha256(repr(stamp).encode()).hexdigest()[:24]}"
+    if directory is not None and stamp:
+        folder = directory / f"numba-{hashlib.sha256(repr(stamp).encode()).hexdigest()[:24]}"
         with suppress(OSError, RuntimeError, AttributeError):
             folder.mkdir(mode=0o755, exist_ok=True)
-            if _is_own(place) and _is_own(folder):
+            if _is_own(directory) and _is_own(folder):
                 before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
                 try:
                     return cast(Callable[..., Result], numba.njit(cache=True, **_OPTIONS)(function))
@@ -463,39 +463,39 @@ def _stamp() -> tuple[str, ...]:
     return sources, llvmlite.__version__, llvm.get_default_triple(), *processor()
 
 
-def cache_places() -> list[Path]:
-    """Return the places of machine code: ``NUMBA_CACHE_DIR``, else a folder of the package, then the user's cache."""
+def cache_directories() -> list[Path]:
+    """Return the directories of machine code: ``NUMBA_CACHE_DIR``, else one of the package, then the user's cache."""
     if named_place := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(named_place)]
-    places = [Path(__file__).parent / "__pycache__"]
+    directories = [Path(__file__).parent / "__pycache__"]
     users = Path(os.environ.get("XDG_CACHE_HOME", ""))
     # The user of a container may have no home directory.
     with suppress(RuntimeError):
-        places.append((users if users.is_absolute() else Path("~/.cache").expanduser()) / "icrtool")
-    return places
+        directories.append((users if users.is_absolute() else Path("~/.cache").expanduser()) / "icrtool")
+    return directories
 
 
-def writable_place() -> Path | None:
-    """Return the first place that can be written, made if it is missing; None if no place can be written."""
-    for place in cache_places():
+def writable_directory() -> Path | None:
+    """Return the first directory that can be written, made if it is missing; None if no directory can be written."""
+    for directory in cache_directories():
         with suppress(OSError):
-            place.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=place).close()
-            return place
+            directory.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=directory).close()
+            return directory
     return None
 
 
 def _keep(name: str, content: bytes) -> None:
     """Write a file to the cache; if it cannot be written (full disk), only this process uses the code."""
-    place = writable_place()
-    if place is None:
+    directory = writable_directory()
+    if directory is None:
         return
     # Other users may read the file, because one user may build an image that another user runs.
-    temporary = place / f"{name}.{os.urandom(8).hex()}"
+    temporary = directory / f"{name}.{os.urandom(8).hex()}"
     with suppress(OSError):
         try:
             temporary.write_bytes(content)
-            temporary.replace(place / name)
+            temporary.replace(directory / name)
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -505,7 +505,7 @@ def njit(function: Function) -> Function:
 
     Notes
     -----
-    If no place can be written (read-only containers, CI sandboxes), it is compiled once in each process.
+    If no directory can be written (read-only containers, CI sandboxes), it is compiled once in each process.
     """
     return cast(Function, Kernel(function))
 

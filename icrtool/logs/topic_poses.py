@@ -42,7 +42,7 @@ def _pose_fields() -> Iterator[tuple[str, tuple[str, ...]]]:
     for name, fix in MESSAGE_TYPES["gnss"].items():
         turn = MESSAGE_TYPES["heading"].get(name)
         if isinstance(fix, Fix) and fix.metric and isinstance(turn, Orientation):
-            yield name, (*fix.place[:2], *(f"{turn.path}.{axis}" for axis in "xyzw"))
+            yield name, (*fix.coordinates[:2], *(f"{turn.path}.{axis}" for axis in "xyzw"))
 
 
 POSE_FIELDS = dict(_pose_fields())

@@ -75,9 +75,9 @@ def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
     messages[0], messages[1] = heads["channel"], heads["time"]
     messages[2], messages[3] = at + _MESSAGE_HEADS.itemsize, at + (9 + heads["length"].astype(np.int64))
     others = []
-    for place in starts[~is_message].tolist():
-        code, length = _HEAD.unpack_from(data.data, place)
-        others.append((code, place, place + 9, place + 9 + length))
+    for offset in starts[~is_message].tolist():
+        code, length = _HEAD.unpack_from(data.data, offset)
+        others.append((code, offset, offset + 9, offset + 9 + length))
     return Records(messages, others, stop)
 
 
@@ -110,16 +110,16 @@ def _message_index(index: bytes) -> tuple[Ints, Ints]:
 
     Both are empty where the index is damaged.
     """
-    places, channels, at = [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
+    offsets, channels, at = [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
     while at + _INDEX_HEAD.size <= len(index):
         code, length, channel, _ = _INDEX_HEAD.unpack_from(index, at)
-        if code != _MESSAGE_INDEX or not 6 <= length <= len(index) - at - _HEAD_BYTES or len(places) > 1 << 16:
-            return places[0], channels[0]
+        if code != _MESSAGE_INDEX or not 6 <= length <= len(index) - at - _HEAD_BYTES or len(offsets) > 1 << 16:
+            return offsets[0], channels[0]
         entries = np.frombuffer(index, "<u8", (length - 6) // 16 * 2, at + _INDEX_HEAD.size)
-        places.append(entries[1::2].astype(np.int64))
+        offsets.append(entries[1::2].astype(np.int64))
         channels.append(np.full(len(entries) // 2, channel))
         at += _HEAD_BYTES + length
-    return np.concatenate(places), np.concatenate(channels)
+    return np.concatenate(offsets), np.concatenate(channels)
 
 
 class McapFile(ChunkedFile):

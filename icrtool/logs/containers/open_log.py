@@ -381,8 +381,8 @@ class BagDirectory(Container):
                 if len(block.log_time_ns):
                     begins.append(int(block.log_time_ns.min()))
                     ends.append(int(block.log_time_ns.max()))
-                place = np.searchsorted(own, block.channel).clip(max=len(own) - 1)
-                yield block._replace(channel=np.where(own[place] == block.channel, merged[place], -1))
+                row = np.searchsorted(own, block.channel).clip(max=len(own) - 1)
+                yield block._replace(channel=np.where(own[row] == block.channel, merged[row], -1))
             self.mixed |= part.mixed
             if begins:
                 spans.append(FileTimes(min(begins), max(ends), file.name))

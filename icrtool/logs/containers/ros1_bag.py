@@ -91,7 +91,7 @@ def _message_index(index: bytes) -> tuple[Ints, Ints]:
 
     Both are empty where the index is damaged.
     """
-    places, connections, at = [_NONE], [_NONE], 0
+    offsets, connections, at = [_NONE], [_NONE], 0
     while at + 8 <= len(index):
         content = at + 8 + int.from_bytes(index[at : at + 4], "little")
         length = int.from_bytes(index[content - 4 : content], "little")
@@ -99,10 +99,10 @@ def _message_index(index: bytes) -> tuple[Ints, Ints]:
         fields = _header_fields(index[at + 4 : content - 4])
         if len(entries) < length or fields.get(b"op") != bytes([_INDEX_DATA]):
             return _NONE, _NONE
-        places.append(np.frombuffer(entries[: length // 12 * 12], "<u4")[2::3].astype(np.int64))
-        connections.append(np.full(len(places[-1]), int.from_bytes(fields.get(b"conn", b"")[:4], "little")))
+        offsets.append(np.frombuffer(entries[: length // 12 * 12], "<u4")[2::3].astype(np.int64))
+        connections.append(np.full(len(offsets[-1]), int.from_bytes(fields.get(b"conn", b"")[:4], "little")))
         at = content + length
-    return np.concatenate(places), np.concatenate(connections)
+    return np.concatenate(offsets), np.concatenate(connections)
 
 
 def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
@@ -252,9 +252,9 @@ class Ros1Bag(ChunkedFile):
                 counts_in_chunk = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
                 for connection, count in counts_in_chunk:
                     counts[connection] = counts.get(connection, 0) + count
-                place = record.number(b"chunk_pos", 8)
+                offset = record.number(b"chunk_pos", 8)
                 connections = frozenset(connection for connection, _ in counts_in_chunk) or None
-                chunks[place] = Chunk(place, 0, connections, record.time(b"start_time"), record.time(b"end_time"))
+                chunks[offset] = Chunk(offset, 0, connections, record.time(b"start_time"), record.time(b"end_time"))
             else:
                 return None
             at = record.at + record.length

@@ -254,7 +254,7 @@ class RemoteFile:
                 break
         return start
 
-    def fetch(self, place: Path, share: Callable[[float], None] | None) -> InputFile:
+    def fetch(self, target: Path, share: Callable[[float], None] | None) -> InputFile:
         """Write the file to a path on disk, and return the file as run.json states it, with SHA-256.
 
         Parameters
@@ -268,9 +268,9 @@ class RemoteFile:
         OSError
             The disk is full.
         """
-        digest, written, saved = hashlib.sha256(), 0, SavedBytes.into(place.parent)
+        digest, written, saved = hashlib.sha256(), 0, SavedBytes.into(target.parent)
         saved.check(self.path, self.size)
-        with place.open("wb") as sink:
+        with target.open("wb") as sink:
             for piece in self._yield_pieces():
                 saved.check(self.path, written + len(piece))
                 if self.size and written + len(piece) > self.size:
@@ -293,8 +293,8 @@ class RemoteFile:
                     ask_server(self.path, partial(check_pace, began_s, received, quiet_s), again=False)
                     yield piece
             return
-        places = range(0, self.size, _FETCHED_BYTES)
-        for _, piece in work_ahead(lambda at: self._range(at, _FETCHED_BYTES), places, PIECES_AHEAD, PIECES_AHEAD):
+        offsets = range(0, self.size, _FETCHED_BYTES)
+        for _, piece in work_ahead(lambda at: self._range(at, _FETCHED_BYTES), offsets, PIECES_AHEAD, PIECES_AHEAD):
             yield piece()
 
     def close(self) -> None:
@@ -446,13 +446,13 @@ def _recordings_below(folder: UrlPath) -> list[UrlPath]:
 
 
 def fetch_folder(
-    path: UrlPath, place: Path, share: Callable[[float], None] | None
+    path: UrlPath, folder: Path, share: Callable[[float], None] | None
 ) -> tuple[tuple[InputFile, ...], dict[str, RemoteFile]]:
     """Write the files of a bag directory at an address to a folder on disk, except MCAP files that are read by ranges.
 
     Parameters
     ----------
-    place : the folder on disk
+    folder : the folder on disk
     share : called with the share of the files that was fetched, 0 to 1
 
     Returns
@@ -472,7 +472,7 @@ def fetch_folder(
     distant: dict[str, RemoteFile] = {}
     for number, (address, about) in enumerate(bag):
         part = (lambda done, before=number: share((before + done) / len(bag))) if share is not None else None
-        remote, file = RemoteFile(address, about), place / address.name
+        remote, file = RemoteFile(address, about), folder / address.name
         if file.suffix == ".mcap" and remote.has_ranges:
             file.touch()
             distant[file.name] = remote

@@ -256,13 +256,13 @@ def is_packed(start: bytes) -> bool:
 
 
 def save_unpacked(
-    source: Readable, place: Path, check: Callable[[bytes], None], check_length: Callable[[int], None]
+    source: Readable, target: Path, check: Callable[[bytes], None], check_length: Callable[[int], None]
 ) -> str:
     """Write a stream to a file, and return its SHA-256 (hex).
 
     Parameters
     ----------
-    place : path of the file
+    target : path of the file
     check : called with the first 512 bytes before more is read; it raises an error to refuse the stream
     check_length : called with the total number of bytes before they are written; it raises an error if it is too large
 
@@ -275,7 +275,7 @@ def save_unpacked(
     while len(start) < _TAR_BLOCK_BYTES and (piece := source.read(_TAR_BLOCK_BYTES - len(start))):
         start += piece
     check(start)
-    with place.open("wb") as sink:
+    with target.open("wb") as sink:
         piece = start
         while piece or (piece := source.read(_PIECE_BYTES)):
             written += len(piece)
@@ -401,9 +401,9 @@ class _Stream:
         decoder_found = next((decoder for magic, decoder in DECODERS.items() if start.startswith(magic)), None)
         return self if decoder_found is None else _Stream(decoder_found(self), self._budget)
 
-    def write_to(self, place: Path, watch: Callable[[], None] | None) -> None:
+    def write_to(self, target: Path, watch: Callable[[], None] | None) -> None:
         """Write the rest of the stream to a file; call `watch` after each piece."""
-        with place.open("wb") as sink:
+        with target.open("wb") as sink:
             while piece := self.read(_PIECE_BYTES):
                 sink.write(piece)
                 if watch is not None:
@@ -431,15 +431,17 @@ def _unpack_file(
     logs: list[str] = []
     found: list[Path] = []
     for name, entry in entries:
-        place = PurePosixPath(name)
+        entry_path = PurePosixPath(name)
         if len(groups) > _MOST_FOLDERS:
             raise LogError(path, f"has logs in more than {_MOST_FOLDERS} folders", "unpack it, and name one of them")
-        if not _PARTS_OF_LOGS.search(place.name):
+        if not _PARTS_OF_LOGS.search(entry_path.name):
             others.append(name)
             continue
-        group = groups.setdefault(place.parent, folder / str(len(groups)) / (place.parent.name.strip(".") or "log"))
+        group = groups.setdefault(
+            entry_path.parent, folder / str(len(groups)) / (entry_path.parent.name.strip(".") or "log")
+        )
         group.mkdir(parents=True, exist_ok=True)
-        target = group / unpacked_name(place.name)
+        target = group / unpacked_name(entry_path.name)
         if target.suffix in LOG_SUFFIXES:
             logs.append(name)
             found.append(target)

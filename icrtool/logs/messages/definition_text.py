@@ -139,9 +139,9 @@ def _parse_problem(reason: str) -> str:
     first, *others = reason.split("\n")
     if not first.startswith("Could not parse") or len(others) < 2:
         return first
-    place = others[1]
+    offset = others[1]
     line = next((line.strip() for line in others[2:] if line.strip()), "")
-    return f"at {line!r}" if line else f"at character {place}"
+    return f"at {line!r}" if line else f"at character {offset}"
 
 
 def _plain_idl(text: str) -> str:

@@ -265,7 +265,7 @@ class Layout:
 def decoding_steps(path: str) -> tuple[Step, ...]:
     """Return the steps of a path such as ``joints[*].name`` or ``position_covariance[4]``."""
     found = (match.groups() for match in _STEP.finditer(path))
-    return tuple(name or (None if place == "*" else int(place)) for name, place in found)
+    return tuple(name or (None if element == "*" else int(element)) for name, element in found)
 
 
 class _Compiler:

@@ -435,11 +435,11 @@ def _spread_stamps(
     rows, stamps = np.flatnonzero(position.usable), position.stamps
     if position.geodetic is not None:
         latitude, longitude, _ = np.radians(position.geodetic[rows]).T
-        place = MEAN_EARTH_RADIUS_M * (latitude + 1j * longitude * np.cos(latitude))
+        position_m = MEAN_EARTH_RADIUS_M * (latitude + 1j * longitude * np.cos(latitude))
     else:
-        place = np.asarray(position.metric, np.float64)[rows] @ np.array([1.0, 1j])
+        position_m = np.asarray(position.metric, np.float64)[rows] @ np.array([1.0, 1j])
     uses_headers = clock == "header" and stamps.header_ns is not None
-    bursts = spread_positions(stamps.on(clock)[rows], place, measured=uses_headers)
+    bursts = spread_positions(stamps.on(clock)[rows], position_m, measured=uses_headers)
     if not (text := bursts.sentence("fixes" if position.geodetic is not None else "poses")):
         return position, heading, []
     if heading is not None and (heading.topic, heading.message_type) == (position.topic, position.message_type):

@@ -98,12 +98,12 @@ LARGEST_STEPS = 0.95
 """Quantile of the steps of the position to which larger steps (jumps, steps over gaps) are reduced."""
 
 
-def spread_positions(stamp_ns: Ints, place: Complexes, *, measured: bool) -> Bursts:
+def spread_positions(stamp_ns: Ints, position: Complexes, *, measured: bool) -> Bursts:
     """Return stamps (n,) [ns] of positions in the given order, spread if the position changes within the packets.
 
     Parameters
     ----------
-    place : (n,) positions in a plane as complex numbers [m]
+    position : (n,) positions in a plane as complex numbers [m]
     measured : whether the stamps are times of measurements, which are equal if the clock rounds them down; otherwise
         they are times of arrival
     """
@@ -111,7 +111,7 @@ def spread_positions(stamp_ns: Ints, place: Complexes, *, measured: bool) -> Bur
     if not bursts.samples:
         return bursts
     order = np.argsort(bursts.stamp_ns, kind="stable")
-    step = np.abs(np.diff(place[order]))
+    step = np.abs(np.diff(position[order]))
     step = np.minimum(step, np.quantile(step, LARGEST_STEPS))
     within = np.diff(bursts.stamp_ns[order]) > np.diff(np.sort(stamp_ns))
     if not (within.any() and (~within).any() and step[within].mean() > EVEN_STEP * step[~within].mean()):

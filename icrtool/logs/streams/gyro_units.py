@@ -95,11 +95,11 @@ def _course_turns(fixes: PositionFixes) -> tuple[Ints, Ints, Floats, bool]:
     True states that half turns are not distinct, because the robot may drive backwards. Begin and end are the middles
     of successive displacements.
     """
-    stamps, place = fixes.stamp_ns, fixes.north_m + 1j * fixes.east_m
-    moved = np.abs(np.diff(place[_spaced(stamps)]))
+    stamps, position = fixes.stamp_ns, fixes.north_m + 1j * fixes.east_m
+    moved = np.abs(np.diff(position[_spaced(stamps)]))
     usual = float(np.median(moved)) if len(moved) else 0.0
     rows = _spaced(stamps, SPAN_S * min(max(2.0 * SHORTEST_CHORD_M / max(usual, 1e-9), 1.0), MOST_SPANS))
-    step = np.diff(place[rows])
+    step = np.diff(position[rows])
     middle = stamps[rows][:-1] + np.diff(stamps[rows]) // 2
     clear = np.abs(step) > SHORTEST_CHORD_M
     both = clear[:-1] & clear[1:] if len(clear) else clear

@@ -266,8 +266,8 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     usable = np.abs(off, out=off) < QUATERNION_NORM_TOLERANCE
     del off
     norm[~usable] = np.nan
-    places, notes = _written_order(q, norm, usable, yaw_rate_radps)
-    ordered = [q[place] for place in places]
+    order, notes = _written_order(q, norm, usable, yaw_rate_radps)
+    ordered = [q[component] for component in order]
 
     def tilt(axis: int) -> float:
         upward = _over_rows(lambda *unit: np.abs(turned_axis(axis, *unit)[2]), ordered, norm)[usable]

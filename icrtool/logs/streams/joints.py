@@ -57,10 +57,12 @@ class Joints:
         if problem:
             return WheelSource(**topic_fields(table), joints=tuple(texts), problem=problem)
         # If all messages list the same joints in the same order, one row of `codes` stands for all of them.
-        places, alike = _places_of(left, right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
+        elements, usable = _elements_of(left, right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
         why = f"{self.label}: left {listed(names[:lefts])}, right {listed(names[lefts:])}"
         paths: dict[Quantity, str] = {"position": self.position, "speed": self.speed}
-        wheels = _by_message(table, paths, places, alike) if alike.any() else _by_own_messages(table, paths, places)
+        wheels = (
+            _by_message(table, paths, elements, usable) if usable.any() else _by_own_messages(table, paths, elements)
+        )
         if wheels is None:
             problem = "the joints of the left and of the right were not recorded at the same time"
             return WheelSource(**topic_fields(table), joints=tuple(texts), problem=problem)
@@ -88,12 +90,12 @@ quantile to come from a second publisher."""
 
 
 def _by_message(
-    table: TopicTable, paths: Mapping[Quantity, str], places: Ints, alike: Bools
+    table: TopicTable, paths: Mapping[Quantity, str], elements: Ints, usable: Bools
 ) -> tuple[WheelColumns, dict[str, Any], tuple[Note, ...]]:
     """Return the columns of messages that list both sides, the fields of a source for its topic, and findings."""
-    if not alike.all():
-        table, places = table.rows(alike), places[alike]
-    columns: WheelColumns = {quantity: _by_wheel(table.find(path), places) for quantity, path in paths.items()}
+    if not usable.all():
+        table, elements = table.rows(usable), elements[usable]
+    columns: WheelColumns = {quantity: _by_wheel(table.find(path), elements) for quantity, path in paths.items()}
     foreign = _of_second_publisher(columns["position"], columns["speed"])
     if foreign is None:
         return columns, topic_fields(table), ()
@@ -172,13 +174,13 @@ def _alternates(columns: Sequence[NDArray[Any]], repeated: Bools) -> bool:
 
 
 def _by_own_messages(
-    table: TopicTable, paths: Mapping[Quantity, str], places: Ints
+    table: TopicTable, paths: Mapping[Quantity, str], elements: Ints
 ) -> tuple[WheelColumns, dict[str, Any], tuple[Note, ...]] | None:
     """Return the columns of wheels with a message for each wheel, at the stamps of the first wheel; as `_by_message`.
 
     Positions are interpolated, speeds are held. None is returned if the wheels were not recorded at the same time.
     """
-    rows = [np.flatnonzero(place >= 0) for place in places.T]
+    rows = [np.flatnonzero(element >= 0) for element in elements.T]
     stamps = [stamp_rows(table.rows(rows_of_wheel)) for rows_of_wheel in rows]
     all_have_headers = all(wheel_stamps.header_ns is not None for wheel_stamps in stamps)
     times = [wheel_stamps.on("header") if all_have_headers else wheel_stamps.log_ns for wheel_stamps in stamps]
@@ -200,11 +202,11 @@ def _by_own_messages(
     for quantity, path in paths.items():
         values = table.find(path)
         for wheel, (rows_of_wheel, order) in enumerate(zip(rows, orders, strict=True)):
-            place = places[rows_of_wheel, wheel]
-            if values is None or place.max() >= values.shape[1]:
+            element = elements[rows_of_wheel, wheel]
+            if values is None or element.max() >= values.shape[1]:
                 columns[quantity] = []
                 break
-            stated = values[rows_of_wheel, place].astype(np.float64)[order]
+            stated = values[rows_of_wheel, element].astype(np.float64)[order]
             if quantity == "position":
                 stated, finite = unwind_turns(stated), np.isfinite(stated)
                 known = finite if finite.any() else ~finite
@@ -219,7 +221,7 @@ def _by_own_messages(
     return columns, source, (joined,)
 
 
-def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: int) -> tuple[Ints, Bools]:
+def _elements_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: int) -> tuple[Ints, Bools]:
     """Return the index of each wheel in the list of each message (n, k), and a mask of the messages (n,) to use.
 
     The index is -1 for a wheel that a message does not list. Only messages with the most frequent set of wheels of both
@@ -229,30 +231,30 @@ def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: i
     wheel = np.full(joints + 1, -1)
     wheel[wheels] = np.arange(len(wheels))
     rows, at = np.nonzero(wheel[codes] >= 0)
-    places = np.full((len(wheels), len(codes)), -1).T
-    places[rows, wheel[codes[rows, at]]] = at
-    present = places >= 0
+    elements = np.full((len(wheels), len(codes)), -1).T
+    elements[rows, wheel[codes[rows, at]]] = at
+    present = elements >= 0
     both: Bools = np.logical_and(present[:, : len(left)].any(axis=1), present[:, len(left) :].any(axis=1))
     sets = present[both]
     if len(sets) and np.any(sets != sets[0]):
         _, which, count = np.unique(sets, axis=0, return_inverse=True, return_counts=True)
         both[both] = which.reshape(-1) == int(np.argmax(count))
-    return places, both
+    return elements, both
 
 
-def _by_wheel(values: NDArray[Any] | None, places: Ints) -> list[Floats]:
+def _by_wheel(values: NDArray[Any] | None, elements: Ints) -> list[Floats]:
     """Return the values (n,) of each wheel, NaN where it is not listed; an empty list if there are no values."""
     if values is None:
         return []
     columns = []
-    for place in places.T:
-        rows = (place >= 0) & (place < values.shape[1])
-        if rows[0] and (place == place[0]).all():
-            columns.append(values[:, place[0]])
+    for element in elements.T:
+        rows = (element >= 0) & (element < values.shape[1])
+        if rows[0] and (element == element[0]).all():
+            columns.append(values[:, element[0]])
         else:
             column = np.full(len(values), np.nan)
-            # If one row of `places` stands for all messages, no message has a value of this wheel.
-            if len(place) == len(column):
-                column[rows] = values[rows, place[rows]]
+            # If one row of `elements` stands for all messages, no message has a value of this wheel.
+            if len(element) == len(column):
+                column[rows] = values[rows, element[rows]]
             columns.append(column)
     return columns

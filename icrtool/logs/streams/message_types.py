@@ -135,7 +135,7 @@ _INSPVAX = Fix(
 )  # fmt: skip
 _METRIC = Fix("metric pose", 70.0, ("pose.position.x", "pose.position.y", "pose.position.z"), metric=True)
 _METRIC_OF_POSE = replace(
-    _METRIC, place=("pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z"),
+    _METRIC, coordinates=("pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z"),
     covariance=("pose.covariance[7]", "pose.covariance[0]", "pose.covariance[1]"),
 )  # fmt: skip
 _XBOT_INDEPENDENT = ("source != 100",)
@@ -256,11 +256,12 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
             solution=Solution("gnss_mode", _SEPTENTRIO_MODE, OTHER_FIX, 15),
         ),
         "novatel_gps_msgs/NovatelPosition": replace(
-            _BESTPOS, place=("lat", "lon", "height + undulation"), std=("lat_sigma", "lon_sigma"),
+            _BESTPOS, coordinates=("lat", "lon", "height + undulation"), std=("lat_sigma", "lon_sigma"),
             valid=(f"solution_status == {_SOLVED}",), solution=_WORD_SOLUTION,
         ),
         "novatel_gps_msgs/Inspvax": replace(
-            _INSPVAX, place=("latitude", "longitude", "altitude + undulation"), std=("latitude_std", "longitude_std"),
+            _INSPVAX, coordinates=("latitude", "longitude", "altitude + undulation"),
+            std=("latitude_std", "longitude_std"),
             valid=(f"ins_status == {_INS_SOLVED}",), solution=_WORD_SOLUTION,
         ),
         "novatel_oem7_msgs/BESTPOS": _BESTPOS,

@@ -135,8 +135,8 @@ class Fix:
     ----------
     label : name of the data, for the reason of a choice
     worth : score of the type; the source with the highest score is chosen
-    place : numbers for `number_of`: latitude and longitude [deg], height above the ellipsoid [m]; if `metric`, x, y, z
-        [m]
+    coordinates : numbers for `number_of`: latitude and longitude [deg], height above the ellipsoid [m]; if `metric`,
+        x, y, z [m]
     std : numbers of the standard deviations to the north and to the east [m], or one number for both
     covariance : numbers of the variances to the north and to the east and of their covariance [m^2]; they are preferred
         to `std`
@@ -150,7 +150,7 @@ class Fix:
 
     label: str
     worth: float
-    place: tuple[str, str, str] = ("latitude", "longitude", "altitude")
+    coordinates: tuple[str, str, str] = ("latitude", "longitude", "altitude")
     std: tuple[str, ...] = ()
     covariance: tuple[str, ...] = ()
     stated: tuple[str, ...] = ()
@@ -163,7 +163,7 @@ class Fix:
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        numbers = (*self.place, *self.std, *self.covariance, self.solution.name)
+        numbers = (*self.coordinates, *self.std, *self.covariance, self.solution.name)
         return fields_in(numbers, (*self.valid, *self.stated, *self.independent))
 
     def read(self, table: TopicTable, config: Config) -> PositionSource:
@@ -178,8 +178,8 @@ class Fix:
         DefinitionError
             The type, as the log defines it, lacks the position.
         """
-        first, second = (number_of(table, coordinate, needed=True) for coordinate in self.place[:2])
-        third = number_of(table, self.place[2])
+        first, second = (number_of(table, coordinate, needed=True) for coordinate in self.coordinates[:2])
+        third = number_of(table, self.coordinates[2])
         status_counts = config.topics.gnss_status == "stated"
         no_fix, finite = ~all_valid(table, self.valid) & status_counts, np.isfinite(first) & np.isfinite(second)
         if self.metric:
@@ -199,18 +199,18 @@ class Fix:
             if count := int(np.count_nonzero(bad & usable)):
                 rejected[reason] = count
             usable &= ~bad
-        places, variance = np.column_stack([first, second, third]), self._variance(table)
+        coordinates, variance = np.column_stack([first, second, third]), self._variance(table)
         silenced = rejected.get("no fix", 0) == len(table) and bool(np.isfinite(variance[:, :2]).any())
         geodetic = metric = None
         if self.metric:
             metric = np.column_stack([second, first])
-            score, why, problem = self.worth, self.label, self._problem(table, places[usable])
+            score, why, problem = self.worth, self.label, self._problem(table, coordinates[usable])
         else:
             plausible = np.abs(third) < HIGHEST_M
             known = third[plausible & usable]
             height = np.where(plausible, third, float(np.median(known)) if len(known) else 0.0)
             geodetic = np.column_stack([first, second, height])
-            score, why = self._worth(places[usable, :2], variance[usable, :2])
+            score, why = self._worth(coordinates[usable, :2], variance[usable, :2])
             counts = ", ".join(f"{reason} {count}" for reason, count in rejected.items())
             problem = "" if usable.any() else f"no usable fix ({counts})"
             problem += "; they state an accuracy: topics.gnss_status=ignored uses them" if silenced else ""
@@ -247,18 +247,18 @@ class Fix:
                 label, score = f"{label} that never moves", score - NEVER_MOVES_PENALTY
         return score, f"{label}, states ±{std:.2g} m" if math.isfinite(std) else f"{label}, states no accuracy"
 
-    def _problem(self, table: TopicTable, places: Floats) -> str:
+    def _problem(self, table: TopicTable, positions_m: Floats) -> str:
         """Return the reason why positions x, y, z (n, 3) [m] are no reference; empty where they may be one."""
         frame = table.text(FRAME_FIELD).lstrip("/")
         is_reference = REFERENCE_WORDS.search(f"{table.topic} {frame}") or frame in REFERENCE_FRAMES
         problem = ""
-        if not len(places):
+        if not len(positions_m):
             problem = "no usable fix" if self.valid else "no finite position"
         elif is_fused(table, self.independent):
             problem = "its positions are fused with the wheels; a reference must be independent of them"
-        elif LEAST_RADIUS_M < np.linalg.norm(np.median(places, axis=0)) < LARGEST_RADIUS_M:
+        elif LEAST_RADIUS_M < np.linalg.norm(np.median(positions_m, axis=0)) < LARGEST_RADIUS_M:
             problem = "its positions are counted from the centre of the earth (ECEF), which is not read"
-        elif not _is_level(places):
+        elif not _is_level(positions_m):
             problem = "its positions lie in a plane that stands upright: z is not up, as in a camera's optical frame"
         elif GOAL_WORDS.search(table.topic):
             problem = GOAL_PROBLEM
@@ -358,15 +358,15 @@ def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[flo
     axes = np.array([turned_axis(axis, *turns) for axis in range(3)]).transpose(2, 0, 1)
     placed = _place_in_roots(
         {
-            name: (link.parent, link.place[-1], frame_axes)
+            name: (link.parent, link.origin_m[-1], frame_axes)
             for (name, link), frame_axes in zip(links.items(), axes, strict=True)
         }
     )
-    root, place, _ = placed[frame]
+    root, antenna_m, _ = placed[frame]
     for base in (name for last in BASE_FRAMES for name in sorted(placed) if name.rsplit("/", 1)[-1] == last):
         base_root, origin, base_axes = placed[base]
         if base_root == root:
-            forward, left, _up = base_axes @ (place - origin)
+            forward, left, _up = base_axes @ (antenna_m - origin)
             if np.hypot(forward, left) <= LARGEST_LEVER_ARM_M:
                 return float(forward), -float(left)
     return None
@@ -403,15 +403,15 @@ class _Link(NamedTuple):
     Attributes
     ----------
     parent : name of the parent frame
-    rows, places : (n,) message of each transform, and its index in the message
-    place : (n, 3) origin of the child in the parent [m]
+    rows, elements : (n,) message of each transform, and its index in the message
+    origin_m : (n, 3) origin of the child in the parent [m]
     turn : (n, 4) quaternion x, y, z, w of the child in the parent
     """
 
     parent: LogText
     rows: Ints
-    places: Ints
-    place: Floats
+    elements: Ints
+    origin_m: Floats
     turn: Floats
 
 
@@ -456,8 +456,8 @@ class _BasePoses(NamedTuple):
     Attributes
     ----------
     root : name of the root frame
-    rows, places : (n,) message of each pose, and the index of its transform in the message
-    place : (n, 3) position [m]
+    rows, elements : (n,) message of each pose, and the index of its transform in the message
+    position_m : (n, 3) position [m]
     turn : (n, 4) quaternion x, y, z, w
     step : (n,) mask of the first pose after each step of the root with respect to an odometry; if the base is a child
         of the root, of all poses
@@ -465,16 +465,16 @@ class _BasePoses(NamedTuple):
 
     root: LogText
     rows: Ints
-    places: Ints
-    place: Floats
+    elements: Ints
+    position_m: Floats
     turn: Floats
     step: Bools
 
     def table_of(self, table: TopicTable, chosen: Bools) -> TopicTable:
         """Return the poses that a mask (n,) chooses as messages of PoseStamped; `table` holds the transforms."""
-        stamps = (table.column(path)[self.rows[chosen], self.places[chosen]] for path in TRANSFORM_STAMP)
+        stamps = (table.column(path)[self.rows[chosen], self.elements[chosen]] for path in TRANSFORM_STAMP)
         frame = np.zeros(np.count_nonzero(chosen), np.int64)
-        values = [*stamps, frame, *self.place[chosen].T, *self.turn[chosen].T]
+        values = [*stamps, frame, *self.position_m[chosen].T, *self.turn[chosen].T]
         columns = dict(zip((*STAMPS[0], FRAME_FIELD, *_POSE), values, strict=True))
         return replace(
             table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[self.rows[chosen]],
@@ -494,23 +494,25 @@ def _base_in_root(table: TopicTable) -> _BasePoses:
     base = next((name for last in BASE_FRAMES for name in links if name.rsplit("/", 1)[-1] == last), None)
     if base is None:
         raise DefinitionError(table.topic, f"it has no transform of a frame {', '.join(BASE_FRAMES)}")
-    root, rows, places, place, turn = links.pop(base)
+    root, rows, elements, position_m, turn = links.pop(base)
     step = np.zeros(len(rows), np.bool_)
     lowest = True
     while root in links:
         above = links.pop(root)
         held = np.searchsorted(above.rows, rows, side="right") - 1
         known = held >= 0
-        rows, places, step, held = rows[known], places[known], step[known], held[known]
-        changed = np.diff(above.place, axis=0).any(axis=1) | np.diff(above.turn, axis=0).any(axis=1)
+        rows, elements, step, held = rows[known], elements[known], step[known], held[known]
+        changed = np.diff(above.origin_m, axis=0).any(axis=1) | np.diff(above.turn, axis=0).any(axis=1)
         version = np.append(0, np.cumsum(changed))[held]
         step[1:] |= version[1:] != version[:-1]
-        outer, place = above.turn[held], place[known]
+        outer, position_m = above.turn[held], position_m[known]
         axes = (np.column_stack(turned_axis(axis, *outer.T)) for axis in range(3))
-        place = above.place[held] + sum(along[:, None] * axis for along, axis in zip(place.T, axes, strict=True))
+        position_m = above.origin_m[held] + sum(
+            along[:, None] * axis for along, axis in zip(position_m.T, axes, strict=True)
+        )
         turn = quaternion_product(outer, turn[known])
         root, lowest = above.parent, False
-    return _BasePoses(root, rows, places, place, turn, step | lowest)
+    return _BasePoses(root, rows, elements, position_m, turn, step | lowest)
 
 
 def _read_links(table: TopicTable) -> dict[str, _Link]:
@@ -521,15 +523,15 @@ def _read_links(table: TopicTable) -> dict[str, _Link]:
     length, size = (np.abs(part).max(axis=-1) for part in (numbers[..., :3], numbers[..., 3:]))
     # The largest component of a unit quaternion is between 0.5 and 1; the limits allow for one that is not normalised.
     sound = (length < LARGEST_TRANSLATION_M) & (size > 0.01) & (size < 100.0)
-    all_rows, all_places = np.nonzero((children >= 0) & sound)
-    order = np.argsort(children[all_rows, all_places], kind="stable")
-    ends = np.cumsum(np.bincount(children[all_rows, all_places], minlength=len(child_names)))
+    all_rows, all_elements = np.nonzero((children >= 0) & sound)
+    order = np.argsort(children[all_rows, all_elements], kind="stable")
+    ends = np.cumsum(np.bincount(children[all_rows, all_elements], minlength=len(child_names)))
     links: dict[str, _Link] = {}
     for name, of_child in zip(child_names, np.split(order, ends[:-1]), strict=True):
         if len(of_child):
-            rows, places = all_rows[of_child], all_places[of_child]
-            pose = numbers[rows, places]
-            parent = LogText(parent_names[parents[rows[-1], places[-1]]].strip("/"))
+            rows, elements = all_rows[of_child], all_elements[of_child]
+            pose = numbers[rows, elements]
+            parent = LogText(parent_names[parents[rows[-1], elements[-1]]].strip("/"))
             turn = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1)[:, None]
-            links[name.strip("/")] = _Link(parent, rows, places, pose[:, :3], turn)
+            links[name.strip("/")] = _Link(parent, rows, elements, pose[:, :3], turn)
     return links

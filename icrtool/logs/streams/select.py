@@ -406,7 +406,7 @@ def check_joints(chosen: WheelSource | None, candidates: Sequence[WheelSource], 
         [(key, name) for key in JOINT_KEYS for name in getattr(config.wheels, key) if name not in motion.joints]
         for motion in listing
     ]
-    closest = min(range(len(listing)), key=lambda place: len(unlisted[place]), default=None)
+    closest = min(range(len(listing)), key=lambda i: len(unlisted[i]), default=None)
     if closest is not None and unlisted[closest]:
         key, name = unlisted[closest][0]
         why, advice = f"no message of {listing[closest].topic} lists a joint {name}", listed(listing[closest].joints)

@@ -37,7 +37,7 @@ from icrtool.logs.streams.wheels import (
     COMMANDED_PENALTY,
     MOST_WHEELS,
     WHEEL_WORDS,
-    column_and_places,
+    column_and_elements,
 )
 from icrtool.records.notes import note
 from icrtool.records.samples import OWN_TWIST, WheelUnit
@@ -116,13 +116,13 @@ class Side:
         DefinitionError
             The messages have no such field or element.
         """
-        column, places = column_and_places(self.path)
+        column, elements = column_and_elements(self.path)
         values = self.table.column(column)
-        if not places:
+        if not elements:
             return [values]
-        if values.ndim != 2 or max(places) >= values.shape[1]:
+        if values.ndim != 2 or max(elements) >= values.shape[1]:
             raise DefinitionError(self.name, "its messages have no such element")
-        return [values[:, place] for place in places]
+        return [values[:, element] for element in elements]
 
 
 class PairNumbers(NamedTuple):
@@ -181,7 +181,7 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
         for topic, _, path in (name.partition(".") for name in named.values()):
             for channel in channels:
                 if channel.topic == topic:
-                    fields[channel.id].add(column_and_places(path or "data")[0])
+                    fields[channel.id].add(column_and_elements(path or "data")[0])
         return fields
     names: dict[str, dict[str, list[tuple[int, str]]]] = {}
     search = _Search()

@@ -112,16 +112,16 @@ def unwind_turns(position: Floats) -> Floats:
 _ELEMENTS = re.compile(r"\[([\d,]+)\]")
 
 
-def column_and_places(path: str) -> tuple[str, list[int]]:
+def column_and_elements(path: str) -> tuple[str, list[int]]:
     """Return the column that holds a field, and the indices of its elements: ``data[*]``, [0, 2] for ``data[0,2]``."""
     match = _ELEMENTS.search(path)
-    places = [int(place) for place in match[1].split(",") if place] if match is not None else []
-    return _ELEMENTS.sub("[*]", path, count=1), places
+    elements = [int(element) for element in match[1].split(",") if element] if match is not None else []
+    return _ELEMENTS.sub("[*]", path, count=1), elements
 
 
 @dataclass(frozen=True, slots=True)
 class FixedWheels:
-    """A message type that has the wheels of each side in separate fields, or at fixed places of lists.
+    """A message type that has the wheels of each side in separate fields, or as fixed elements of lists.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class FixedWheels:
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        return tuple(column_and_places(path)[0] for path in (*self.position, *self.speed))
+        return tuple(column_and_elements(path)[0] for path in (*self.position, *self.speed))
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
         """Return the motion of both sides.
@@ -156,16 +156,16 @@ class FixedWheels:
 
         def wheels_of(quantity: Quantity) -> list[NDArray[Any]]:
             wheels: list[NDArray[Any]] = []
-            for column, places in map(column_and_places, paths[quantity]):
+            for column, elements in map(column_and_elements, paths[quantity]):
                 values = table.find(column)
                 if values is None:
                     return []
-                if places and (values.ndim != 2 or max(places) >= values.shape[1]):
-                    raise DefinitionError(table.topic, f"{column} holds fewer than {max(places) + 1} elements")
-                wheels += [values[:, place] * self.factor for place in places] or [values * self.factor]
+                if elements and (values.ndim != 2 or max(elements) >= values.shape[1]):
+                    raise DefinitionError(table.topic, f"{column} holds fewer than {max(elements) + 1} elements")
+                wheels += [values[:, element] * self.factor for element in elements] or [values * self.factor]
             return wheels
 
-        lefts, rights = (len(column_and_places(path)[1]) or 1 for path in self.position or self.speed)
+        lefts, rights = (len(column_and_elements(path)[1]) or 1 for path in self.position or self.speed)
         names = [f"wheel {i}" for i in range(lefts + rights)]
         return average_wheels(
             wheels_of, lefts, names, self.unit, **topic_fields(table), score=self.worth, why=self.label
@@ -178,7 +178,7 @@ _HALF_COUNTER = 1 << 31
 TICK_FIELDS = (
     "wheel_tick_factor",
     "valid_wheels",
-    *(f"wheel_{field}_{place}" for field in ("ticks", "direction") for place in ("fl", "fr", "rl", "rr")),
+    *(f"wheel_{field}_{wheel}" for field in ("ticks", "direction") for wheel in ("fl", "fr", "rl", "rr")),
 )
 """Fields of xbot_msgs/WheelTick: factor, mask of the wheels, and ticks and direction of each wheel."""
 
@@ -196,7 +196,7 @@ def read_ticks(table: TopicTable, _: Config) -> WheelSource:
     """
     valid = table.integers("valid_wheels")
     bits = int(np.bitwise_or.reduce(valid)) if valid is not None else 0
-    axles = [place for place, both in (("f", 3), ("r", 12)) if bits & both == both] or ["r"]
+    axles = [axle for axle, both in (("f", 3), ("r", 12)) if bits & both == both] or ["r"]
     # The median of infinite numbers of both signs is NaN.
     with np.errstate(invalid="ignore"):
         per_metre = float(np.median(table.floats("wheel_tick_factor")))

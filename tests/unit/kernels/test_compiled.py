@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from icrtool.kernels import compiled
-from icrtool.kernels.compiled import all_kernels, cache_places, njit
+from icrtool.kernels.compiled import all_kernels, cache_directories, njit
 
 CALL = """
 import sys
@@ -228,7 +228,7 @@ def test_where_numba_differs_a_kernel_is_plain_njit_with_its_cache(
         assert not compiled.passes_as_expected()
     compiled.passes_as_expected.cache_clear()
     assert values.tolist() == [2.0, 1.0, 0.0]
-    [folder] = cache_places()[0].iterdir()
+    [folder] = cache_directories()[0].iterdir()
     assert folder.name.startswith("numba-")
     assert list(folder.rglob("*.nbc"))
     assert not list(folder.rglob("*.o"))
@@ -250,7 +250,7 @@ def test_numba_finds_its_own_cache_again(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_numba_keeps_nothing_where_others_may_write(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled, "_RETURNED", (7,))
     compiled.passes_as_expected.cache_clear()
-    place = cache_places()[0]
+    place = cache_directories()[0]
     place.mkdir()
     place.chmod(0o777)
     assert njit(weigh)(*arguments()) == pytest.approx(weigh(*arguments()), abs=1e-12)
@@ -264,7 +264,7 @@ def rise(value: float) -> float:
 
 def test_numba_runs_what_calls_more_than_the_known_functions() -> None:
     assert njit(rise)(0.5) == pytest.approx(math.log1p(0.5))
-    assert not list(cache_places()[0].rglob("*.o"))
+    assert not list(cache_directories()[0].rglob("*.o"))
 
 
 def double(value: float) -> float:
@@ -275,7 +275,7 @@ def test_numbers_of_numpy_are_taken_as_those_of_python() -> None:
     kernel = njit(double)
     assert [kernel(one) for one in (np.uint64(3), -1, np.float32(0.5), 0.25)] == [6, -2, 1.0, 0.5]
     assert kernel.compiled == 2
-    assert len(list(cache_places()[0].glob("*.o"))) == 2
+    assert len(list(cache_directories()[0].glob("*.o"))) == 2
 
 
 @pytest.mark.parametrize("wrong", ["text", 2**63, [1.0]], ids=repr)
@@ -294,7 +294,7 @@ def test_nothing_is_kept_of_what_numba_does_to_find_faults(
     assert kernel(2.0) == 4.0
     compiled._stamp.cache_clear()
     assert kernel.compiled == compiles
-    assert not list(cache_places()[0].glob("*"))
+    assert not list(cache_directories()[0].glob("*"))
 
 
 def test_code_for_another_processor_or_target_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,13 +349,13 @@ def test_a_kernel_compiles_again_where_any_file_of_kernels_has_changed(
 def test_a_user_without_a_home_has_no_cache_there(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
-    assert len(cache_places()) == 2
+    assert len(cache_directories()) == 2
 
     def homeless(path: Path) -> Path:
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.setattr(Path, "expanduser", homeless)
-    assert cache_places() == [Path(compiled.__file__).parent / "__pycache__"]
+    assert cache_directories() == [Path(compiled.__file__).parent / "__pycache__"]
 
 
 def test_every_kernel_is_found() -> None:
