@@ -216,6 +216,7 @@ def alignment_estimates(streams: AlignedStreams, antenna_m: tuple[float, float])
 
     Parameters
     ----------
+    streams : the aligned streams
     antenna_m : position of the antenna in the body frame, forward and right [m]; ICRs refer to the body origin
     """
     wheels, heading, delays = streams.wheels, streams.heading, streams.delays

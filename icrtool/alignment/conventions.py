@@ -147,6 +147,7 @@ def decide_conventions(
 
     Parameters
     ----------
+    windows : windows of the drive
     metric : whether positions may be mirrored, as poses in a local frame may; geodetic positions may not
     gyro_sense : result of `gyro_sense`
     mirror_allowed : whether the heading may be mirrored
@@ -290,6 +291,7 @@ def convention_notes(decision: Decision, *, corrects: bool, mirrored: bool = Fal
 
     Parameters
     ----------
+    decision : the decision
     corrects : whether the preset corrects them
     mirrored : whether the log has neither gyro nor heading, so that swapped sides and mirrored positions look alike
     """

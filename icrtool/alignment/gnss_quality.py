@@ -82,6 +82,8 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
 
     Parameters
     ----------
+    log : the log
+    config : the configuration
     steps : steps between the fixes minus the motion of the wheels
     measured_m : as in `icrtool.alignment.sensor_noise.fixes_of`
     """
@@ -225,6 +227,7 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
     Parameters
     ----------
     stamps : (m,) stamps of the fixes [ns]
+    steps : steps from fix to fix
     claimed : (m,) mask of the fixes that are reported as fixed
     flagged : (m,) mask of the fixes that are reported as fixed by a flag, not only by their variance
     """

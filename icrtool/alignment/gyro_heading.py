@@ -197,6 +197,7 @@ def estimate_heading(
 
     Parameters
     ----------
+    track : the drive
     turn : turn rate of a gyro, or of the wheels with a wide prior of its scale
     absolute : further headings
     stands : whether the rate is zero while the wheels stand
@@ -313,7 +314,9 @@ class _LogEvents:
 
         Parameters
         ----------
+        noises : noises by name
         correlated_courses : number of courses over ground that count as one, because their errors are correlated
+        count : number of events; None: all
         """
         stated, kind = self.as_stated.cut(count), self.kind[:count]
         course_variance = (

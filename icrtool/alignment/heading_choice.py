@@ -191,6 +191,7 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
 
     Parameters
     ----------
+    log : the log
     track : track of the log
     """
     if track.same_clock:
@@ -318,6 +319,7 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
 
     Parameters
     ----------
+    log : the log
     scatter_rad : scatter of the heading about the course over ground [rad]
     width_m : the track width b [m]
     """

@@ -154,6 +154,7 @@ def fix_std_m(gnss: PositionFixes | Fixes, track: Track | None = None) -> float:
 
     Parameters
     ----------
+    gnss : the fixes
     track : of the same fixes, whose wheels explain a part of the motion between rare fixes
 
     Notes
@@ -181,6 +182,8 @@ def windows_of_log(
 
     Parameters
     ----------
+    log : the log
+    width_m : track width [m]
     heading : in place of the log's own; measured_t : times at which it was measured, `Track.measured_t`
     """
     track = track_of_log(log, heading)
@@ -196,6 +199,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
 
     Parameters
     ----------
+    track : the drive
     least_m : shortest window; noise of the fixes and held wheel values make windows longer
     length_m : length of the windows in place of the computed one; 0: not given
     """

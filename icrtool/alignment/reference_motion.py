@@ -252,6 +252,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
 
     Parameters
     ----------
+    knots : the reference, at its knots
     width_m : the track width b [m]
     quiet : (m,) knots that may be inside a window
     """

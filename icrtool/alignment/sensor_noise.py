@@ -225,6 +225,8 @@ def fixes_of(gnss: PositionFixes, settings: FilterConfig, measured_m: float = ma
 
     Parameters
     ----------
+    gnss : the fixes of the log
+    settings : settings of the filter
     measured_m : result of `reference_noise`; if it is not NaN, every fix has this noise
     """
     # The diagonal plus the covariance's size is never below the full matrix: correlated fixes are not overrated.
@@ -277,6 +279,8 @@ def reference_noise(
 
     Parameters
     ----------
+    log : the log
+    settings : settings of the filter
     position_steps, turn_steps : steps of the positions and of the headings against the wheels
 
     Notes

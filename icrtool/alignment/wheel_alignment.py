@@ -124,6 +124,7 @@ def bridge_gaps(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[Wheel
 
     Parameters
     ----------
+    wheels : the wheel samples
     gap_s : longest interval between samples that is no gap [s]
     fixes : a gap in which the fixes contradict the wheel positions is not filled
 
@@ -187,6 +188,7 @@ def align_wheels(
     Parameters
     ----------
     log : with the configured scales (left, right) already applied; the factors are in addition to them
+    config : the configuration
     fit : alignment of the log, None where the drive is too short
     sound : no side is dead or a copy of the other
     """
@@ -362,6 +364,7 @@ def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Seque
 
     Parameters
     ----------
+    track : the drive
     width_m : the track width b [m]
     delay_s : lag of the heading behind the wheels [s]
     windows_s : lengths of the windows [s]

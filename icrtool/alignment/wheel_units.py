@@ -196,6 +196,8 @@ def wrong_size(scale: Scale, log: RobotLog, config: Config) -> Note | None:
     Parameters
     ----------
     scale : differs from 1 by more than tyres and soil explain
+    log : the log
+    config : the configuration
     """
     if not (scale.value > 0.0 and scale.std <= LARGEST_SIZE_STD * scale.value):
         return None
@@ -231,6 +233,7 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
 
     Parameters
     ----------
+    log : the log
     windows : windows of the log. Without windows the robot stands if its positions stay within their noise. A log of a
         robot on a stand has no windows, because it shows no heading or no unit; a log of a robot that spins on the spot
         may have windows

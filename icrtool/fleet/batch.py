@@ -174,6 +174,7 @@ def find_finished_row(request: LogRequest, folder: Path) -> FleetLog | None:
 
     Parameters
     ----------
+    request : the log and its settings
     folder : folder of the results, on disk
     """
     try:
@@ -199,6 +200,7 @@ def run_batch(
     ----------
     requests : results of `plan_requests`
     executor : executor that calls `process_apart`, in threads on this machine or in workers of a cluster
+    batch : request of the whole batch
     watch : called with log and stage when a stage begins, if the executor is on this machine
     lost : returns the reason why the executor can process no more logs; empty while it can
     folder : folder of the results on disk if they go to an address

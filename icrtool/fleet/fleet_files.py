@@ -68,6 +68,7 @@ def check_tables(folder: Path, *, page: bool) -> None:
 
     Parameters
     ----------
+    folder : folder of the fleet
     page : whether the batch writes a page
 
     Raises
@@ -136,7 +137,9 @@ def write_fleet(
 
     Parameters
     ----------
+    rows : rows of the logs
     directory : folder of the batch
+    calibrations : calibrations of the groups
     plots : formats of the figures
     page : whether to write report.html
 
@@ -186,6 +189,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
 
     Parameters
     ----------
+    rows : rows of the logs
     folder : folder of the batch
     picture_formats : formats of the files
     """
@@ -253,6 +257,7 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
 
     Parameters
     ----------
+    rows : rows of the logs
     missing : logs of the baseline that the batch does not have
     """
     # The import is inside the function, because a process that fits logs does not need these modules.
@@ -304,6 +309,7 @@ def pooled_calibrations(
 
     Parameters
     ----------
+    rows : rows of the logs
     directory : folder of the batch on disk, to which the calibration files are written
     place : folder or address of the runs; None: `directory`
     allow_unusable : whether unusable runs are calibrated too

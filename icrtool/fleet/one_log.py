@@ -49,6 +49,7 @@ def process_log(request: LogRequest, watch: Watch) -> FleetLog:
 
     Parameters
     ----------
+    request : the log and its settings
     watch : called with the name of each stage when it begins
     """
     begun = time.monotonic()
@@ -76,6 +77,8 @@ def row_of_failure(request: LogRequest, reason: str, *, details: str = "", repea
 
     Parameters
     ----------
+    request : the log and its settings
+    reason : reason of the failure
     details : last lines of the output of its process
     repeatable : whether the same input would fail again
     """

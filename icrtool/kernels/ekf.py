@@ -317,6 +317,9 @@ def filter_rows(
     Parameters
     ----------
     data : result of `compiled_inputs`
+    state : state of the filter, which is changed in place
+    parameters : parameters of the filter
+    out : the output, which is filled
     first : wheel sample of the first column of ``out.states``
     """
     events = events_until(data, begin, end, state.reached[0])

@@ -162,7 +162,8 @@ class FilterState(NamedTuple):
     ----------
     reached : (2,) time [s], and path length until then [m]
     rejected : (2, 4) argument `run` of `store_rejection`, for fixes and for headings
-    x : (6,); P : (6, 6)
+    x : (6,) the states
+    P : (6, 6) covariance of the states
     """
 
     reached: Floats

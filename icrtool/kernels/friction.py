@@ -115,6 +115,7 @@ def load_growth(a_x: float, a_y: float, sum_xx: float, sum_yy: float, body: Slid
     ----------
     a_x, a_y : acceleration that the load follows [m/s^2]
     sum_xx, sum_yy : `second_moments` of the contacts [m^2]
+    body : the simulated body
     """
     per_x = (GRAVITY_MPS2 * body.mass_forward - a_x * body.mass_height) * body.mass / sum_xx
     per_y = (GRAVITY_MPS2 * body.mass_right - a_y * body.mass_height) * body.mass / sum_yy
@@ -129,6 +130,7 @@ def driver_commands(forward: float, turn: float, heading_error: float, body: Sli
     ----------
     forward, turn : velocity [m/s] and turn rate [rad/s] that the driver wants
     heading_error : wanted minus true heading [rad], which the driver steers against
+    body : the simulated body
     """
     wanted = turn + body.steering * heading_error
     wanted = min(max(wanted, -body.largest_turn), body.largest_turn)
@@ -142,6 +144,7 @@ def origin_velocity(u: float, w: float, omega: float, body: SlidingBody) -> tupl
     Parameters
     ----------
     u, w, omega : velocity of the centre of mass, ahead and to the right [m/s], and turn rate [rad/s]
+    body : the simulated body
     """
     return u + omega * body.mass_right, w - omega * body.mass_forward
 

@@ -78,6 +78,8 @@ def smooth_passes(F: Floats, x_predicted: Floats, P_predicted: Floats, x: Floats
     ----------
     F : (n - 1, k, k) transition from each event to the next one
     x_predicted, P_predicted : (n, k), (n, k, k) state and covariance that were predicted at each event
+    x : (n, k) states
+    P : (n, k, k) covariances
 
     Notes
     -----

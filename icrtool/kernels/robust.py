@@ -46,6 +46,7 @@ def mad_std(values: Floats, centre: float | None = None) -> float:
 
     Parameters
     ----------
+    values : (m,) values; they are not changed
     centre : value from which deviations are measured; default: the median. It is 0 for residuals
 
     Notes

@@ -280,6 +280,7 @@ def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Rows:
 
     Parameters
     ----------
+    track : the drive
     horizons_m : (h,) distances [m], in any order
     starts : (k,) rows at which the distances begin, ascending
 

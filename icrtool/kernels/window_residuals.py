@@ -135,6 +135,7 @@ def window_residuals(
 
     Parameters
     ----------
+    path : path at knots
     start, end : (w,) knots of each window; reference : complex (w,) displacement [m]; root : (w,) [m^0.5]
     offset : angle that is added to the reference's heading [rad]
     shortened : (w,) ratio of the mean displacement with a wandering heading to the displacement without
@@ -155,6 +156,7 @@ def turn_residuals(path: PathKnots, start: Ints, end: Ints, turned: Floats, root
 
     Parameters
     ----------
+    path : path at knots
     start, end : (w,) knots of each window; turned : (w,) turn of the reference [rad]; root : (w,) [m^0.5]
     """
     by = np.zeros((len(path.heading_by) + 2, len(start)))

@@ -60,6 +60,7 @@ def survey_log(
     Parameters
     ----------
     path : path or address of a log, as for `read_log`, but no table
+    config : the configuration
     progress : called with the share of the log that has been read, 0 to 1
     start, end : as for `read_log`
 
@@ -162,6 +163,7 @@ def collect_tables(
 
     Parameters
     ----------
+    container : the opened log
     wanted : paths of the fields to read, by channel id
     cut : part of the log that is read
     progress : called with the share of the log that has been read, 0 to 1
@@ -245,6 +247,7 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
 
     Parameters
     ----------
+    container : the opened log
     start, end : results of `read_moment`; None: begin or end of the log
     log : path of the log in errors
 
@@ -296,6 +299,7 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
 
     Parameters
     ----------
+    path : path of the CSV file
     start, end : as for `read_log`
 
     Raises

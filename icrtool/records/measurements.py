@@ -292,9 +292,11 @@ class Measurements:
 
     Attributes
     ----------
+    sensors : the aligned sensors
     estimates : estimates by name with unit; run.json has them as ``alignment``
     streams : the log's chosen topics; ``why`` also names the unit of the wheels
     wheels, heading : facts of wheels and heading, for run.json
+    fix_statistics : statistics of the position fixes
     notes : findings, in the order they were made
     """
 
@@ -332,6 +334,7 @@ class SlipEvent(Record, frozen=True):
 
     Attributes
     ----------
+    kind : kind of the event, see `SlipKind`
     begin_ns, end_ns : stamps of the wheel clock [ns]
     north_m, east_m : position at the start, in the local plane [m]
     distance_m : length of the robot's path through the event, by the position reference [m]
@@ -358,6 +361,7 @@ class ReferenceJump(Record, frozen=True):
 
     Attributes
     ----------
+    kind : kind of the jump, see `JumpKind`
     begin_ns, end_ns : stamps of the wheel clock [ns]: of the last pose that the filter followed before the jump, and of
         the first pose that it followed after the jump
     north_m, east_m : position before the jump, in the local plane [m]

@@ -24,6 +24,7 @@ class Preset:
 
     Attributes
     ----------
+    name : name of the preset
     corrects : errors of the streams (conventions, offsets, delays, scales, gaps, slip events) are found and corrected;
         False: the streams are used as they were sent
     measures_noise : noise is taken from the messages and from the drive; False: from the configuration alone

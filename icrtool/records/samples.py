@@ -222,10 +222,14 @@ class StreamChoice:
 
     Attributes
     ----------
+    role : wheels, gnss or heading
     topic : topic name; a left/right pair reads ``/left + /right``
+    message_type : type of the messages
+    count : number of samples
     rate_hz : 1 / median interval; None where not known
     clock : ``header`` or ``log``: which stamps are used
     jitter_ms : standard deviation of the interval between samples, None where not known
+    why : reason of the choice
     """
 
     role: Role

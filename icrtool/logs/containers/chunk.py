@@ -127,6 +127,7 @@ def decompress(packed: PackedChunk, space: Bytes) -> Bytes:
 
     Parameters
     ----------
+    packed : the compressed content
     space : memory for the decompressed bytes and one further byte
 
     Returns
@@ -230,6 +231,8 @@ def record_starts(
 
     Parameters
     ----------
+    data : memory with the records
+    begin : offset of the first record
     hint : (m,) offsets of messages by the index, ascending; None without an index
     record_end : returns the end of the record at a byte, given the end of the data; the byte itself without a record
     message_ends : returns the ends of messages (n,); the offset of a message where there is none

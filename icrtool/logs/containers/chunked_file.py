@@ -64,6 +64,7 @@ class ChunkPart(NamedTuple):
 
     Attributes
     ----------
+    chunk : the chunk
     messages : (m,) offsets of the messages in the records that are read, by the index; None without an index
     ranges : (2, n) begin and end offsets of the wanted records if only these are read; None: all are read
     held : bytes of a distant file that were read ahead and contain the chunk; None: not read ahead

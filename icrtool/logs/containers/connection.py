@@ -266,6 +266,7 @@ def ask_server(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, 
 
     Parameters
     ----------
+    path : address of the file
     ask : sends the request and returns the answer
     again : whether the request is repeated after a broken connection
     done : purpose of the request in messages: ``read`` or ``written``

@@ -148,6 +148,7 @@ def work_ahead(
     Parameters
     ----------
     work : function that is called with each item, in a thread
+    items : items to work on
     threads : number of threads
     count : largest number of items that are worked on before they are yielded
     weight : returns the weight of an item; items are worked on ahead up to a total weight of 1
@@ -173,6 +174,7 @@ def make_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None
 
     Parameters
     ----------
+    blocks : blocks, made one after the other
     stop : called when the caller wants no more blocks; it ends the work of the thread
     """
     with ThreadPoolExecutor(1) as pool:

@@ -64,6 +64,7 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
 
     Parameters
     ----------
+    path : path or address of the log
     share : called with the share of the log that was fetched or unpacked, 0 to 1
 
     Raises

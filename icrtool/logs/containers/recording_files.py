@@ -107,6 +107,7 @@ def bag_files(directory: Path, report: Callable[[str, str], None]) -> BagFiles:
 
     Parameters
     ----------
+    directory : directory of the bag
     report : called with code and text of each finding about metadata.yaml
 
     Raises

@@ -110,6 +110,8 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
 
     Parameters
     ----------
+    data : memory with the records
+    begin : offset of the first record
     hint : (n,) offsets of messages by the index, ascending; None without an index
     """
     starts, stop = record_starts(data, begin, hint, _behind_record, _record_ends)

@@ -259,6 +259,7 @@ class RemoteFile:
 
         Parameters
         ----------
+        target : path of the file on disk
         share : called with the share of the file that was fetched, 0 to 1
 
         Raises
@@ -452,6 +453,7 @@ def fetch_folder(
 
     Parameters
     ----------
+    path : address of the folder
     folder : the folder on disk
     share : called with the share of the files that was fetched, 0 to 1
 

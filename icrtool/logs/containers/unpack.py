@@ -262,6 +262,7 @@ def save_unpacked(
 
     Parameters
     ----------
+    source : the stream
     target : path of the file
     check : called with the first 512 bytes before more is read; it raises an error to refuse the stream
     check_length : called with the total number of bytes before they are written; it raises an error if it is too large
@@ -291,6 +292,7 @@ def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = Non
 
     Parameters
     ----------
+    path : path of the file
     folder : folder for the unpacked files, which keep the names that they have in an archive
     share : called with the share of the file that was unpacked, 0 to 1
 

@@ -78,6 +78,7 @@ class DecodedValues:
 
         Parameters
         ----------
+        path : path of the field
         known : code of each text, from 0; texts that are not in it are added
         """
         if "[*]" in path:

@@ -336,6 +336,7 @@ class Decoded:
 
         Parameters
         ----------
+        path : path of the field
         known : code of each text, from 0; texts that are not in it are added
         """
         slot = self.layout.slots[path].slot_index
@@ -391,6 +392,7 @@ def text_codes(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
 
     Parameters
     ----------
+    texts : the texts
     known : code of each text; texts that are not in it are added, beyond `MOST_TEXTS` all under the code of `FURTHER`
     """
     if len(known) + len(texts) <= MOST_TEXTS:
@@ -414,6 +416,7 @@ def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:
 
     Parameters
     ----------
+    channel : the channel
     wanted : paths of the wanted fields, as for `compile_layout`
 
     Raises

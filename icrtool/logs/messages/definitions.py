@@ -249,6 +249,7 @@ class Layout:
 
     Attributes
     ----------
+    program : operations in the order of the fields
     slots : wanted fields by path; if a definition has a field twice, the second one
     slot_count : number of slots of the program
     cdr : whether the messages are CDR, in which numbers are aligned; otherwise ROS 1

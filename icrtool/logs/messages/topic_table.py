@@ -143,6 +143,7 @@ class TopicTable:
 
     Attributes
     ----------
+    topic, message_type : name of the topic, and type of its messages
     log_time_ns : (n,) int64, times at which the recorder received the messages
     columns : values by the path of their field: float64 or int64, (n,), or (n, k) for an array, with NaN or 0 where a
         message has fewer elements. The column of a text field holds indices into `texts`
@@ -359,6 +360,7 @@ def collector_for(
 
     Parameters
     ----------
+    channel : the channel
     wanted : paths of the wanted fields, as for `icrtool.logs.messages.definitions.compile_layout`
     before : collector of another channel of the topic, to which the decoder is added; None: a new collector
     budget : budget of the log for definitions; None: a new budget for this channel

@@ -103,6 +103,7 @@ def spread_positions(stamp_ns: Ints, position: Complexes, *, measured: bool) -> 
 
     Parameters
     ----------
+    stamp_ns : (n,) stamps [ns]
     position : (n,) positions in a plane as complex numbers [m]
     measured : whether the stamps are times of measurements, which are equal if the clock rounds them down; otherwise
         they are times of arrival

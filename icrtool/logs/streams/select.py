@@ -137,6 +137,8 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
 
     Parameters
     ----------
+    tables : tables of the topics
+    config : the configuration
     unread : reason why a topic was not decoded, by topic
     """
     topics = config.topics
@@ -247,6 +249,8 @@ def choose_streams(
 
     Parameters
     ----------
+    candidates : sources of each role
+    config : the configuration
     log : path of the log in errors
     channels : all channels of the log, for errors
     lost : text about unreadable parts of the log, for errors
@@ -395,6 +399,7 @@ def check_joints(chosen: WheelSource | None, candidates: Sequence[WheelSource], 
     chosen : the chosen wheels, None without usable wheels
     candidates : all wheels that were found; if `chosen` lists no joints, the topic with the most configured joints is
         named in the error
+    config : the configuration
 
     Raises
     ------

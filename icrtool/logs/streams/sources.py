@@ -440,6 +440,7 @@ def number_of(table: TopicTable, text: str, *, needed: bool = False) -> Floats:
 
     Parameters
     ----------
+    table : messages of the topic
     text : description of the number for `terms_of`
     needed : whether the first field must exist
 

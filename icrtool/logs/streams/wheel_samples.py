@@ -23,7 +23,9 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
 
     Parameters
     ----------
+    motion : source of the wheels
     stamps : (n,) stamps of the rows of `motion` [ns]
+    config : the configuration
     log_name : name of the log in errors
 
     Raises
