@@ -248,7 +248,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     refuse_standing(log, windows)
     fit, convention = estimate_alignment(windows, width), decision.convention
     if derived is not None:
-        heading, correlation_s, of_heading = align_heading(log, config, None, NOT_COMPARED, convention, derived)
+        heading, correlation_s, heading_notes = align_heading(log, config, None, NOT_COMPARED, convention, derived)
     else:
         course, free = compare_with_course(windows), config.frames.heading_offset_deg == "auto" and corrects
         may_derive = free and config.frames.heading == "auto"
@@ -263,7 +263,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
                 return align_streams(bare, config)
             refuse_unexplained(log, fit, course)
         derived = fuse_heading(log, windows.track) if may_derive else None
-        heading, correlation_s, of_heading = align_heading(log, config, fit, course, convention, derived)
+        heading, correlation_s, heading_notes = align_heading(log, config, fit, course, convention, derived)
         if derived is not None:
             log = derived.apply(log)
             windows = _windows(log, width, derived)
@@ -271,8 +271,8 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     configured = configured_scales(config)
     if convention.swapped and corrects:
         configured = configured[::-1]
-    wheels, scales, of_wheels = align_wheels(log, config, fit, configured, sound=sound)
-    delays, of_delays = find_delays(log, config, fit)
+    wheels, scales, wheel_notes = align_wheels(log, config, fit, configured, sound=sound)
+    delays, delay_notes = find_delays(log, config, fit)
     log = with_scaled_wheels(log, *scales)
     lags = {"gnss": delays.applied_gnss_s, "heading": delays.applied_heading_s}
     lags["heading"] = lags["gnss"] if delays.together else lags["heading"]
@@ -282,7 +282,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         if lags[name] != 0.0
     }
     log = replace(log, **moved) if moved else log
-    findings = notes_about(log.name, (*notes, *of_wheels, *of_heading, *of_delays))
+    findings = notes_about(log.name, (*notes, *wheel_notes, *heading_notes, *delay_notes))
     return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, findings)
 
 

@@ -256,8 +256,8 @@ def align_heading(
     elif derived is not None:
         notes = [note("heading_estimated", f"the heading is estimated: {derived.why}")]
     stated_type = next((stream.message_type for stream in log.streams if stream.role == "heading"), "")
-    of_antennas = any(name in stated_type for name in DUAL_ANTENNA_TYPES)
-    source = "dual_antenna_message" if of_antennas else "orientation"
+    by_antennas = any(name in stated_type for name in DUAL_ANTENNA_TYPES)
+    source = "dual_antenna_message" if by_antennas else "orientation"
     facts = HeadingFacts(
         source=source if derived is None else derived.source,
         parts=None if derived is None else derived.why,

@@ -163,8 +163,8 @@ def find_limit(wheels: WheelSamples, fit: AlignmentFit) -> SpeedLimit | None:
 
     residuals, laid = residuals_by_estimate(fit), windows.over(track.at_places(track.mean_speed))
     # Slip in turns makes a robot go less far than its wheels, not further.
-    of_places = share(track.place_t[windows.begin], track.place_t[windows.end])
-    further = _difference(laid, laid - residuals.before[0], of_places, windows.group)
+    fix_share = share(track.place_t[windows.begin], track.place_t[windows.end])
+    further = _difference(laid, laid - residuals.before[0], fix_share, windows.group)
     predicted = residuals.turn_after + residuals.turn_rad
     more = _difference(predicted, residuals.turn_rad, share(windows.turn_begin, windows.turn_end), windows.turn_group)
     sigmas = max(further, more)

@@ -220,12 +220,12 @@ def advance(
         x[0] += G[1, 0]
         x[1] -= G[0, 0]
         x[2] += turn
-    of_pose = of_icrs = dt * dt
+    pose_factor = icr_factor = dt * dt
     if parameters.rate_invariant:
-        of_pose = REFERENCE_STEP_S * dt
-        of_icrs = of_pose * wheel_speed(v_left, v_right)
+        pose_factor = REFERENCE_STEP_S * dt
+        icr_factor = pose_factor * wheel_speed(v_left, v_right)
     for i in range(6):
-        P[i, i] += (of_pose if i < 3 else of_icrs) * parameters.process_variance[i]
+        P[i, i] += (pose_factor if i < 3 else icr_factor) * parameters.process_variance[i]
     if len(data.turn_variance) > 0:
         P[2, 2] += data.turn_variance[held] * dt
     if not in_gap:

@@ -265,15 +265,19 @@ def error_intervals(
     expected_m = float(errors_m[blocks.rows].mean()) if sums is None else float(sums.errors_m.sum() / sums.trials.sum())
     if not (expected_m > 0.0 and p95_m > 0.0):
         return Intervals(expected_m, expected_m, p95_m, p95_m, p95_m, p95_m)
-    of_length = spread.horizon_std**2 / blocks.horizons
-    measured = (of_length, of_length) if sums is None else _block_variances(errors_m, blocks, sums, expected_m)
+    length_variance = spread.horizon_std**2 / blocks.horizons
+    measured = (
+        (length_variance, length_variance) if sums is None else _block_variances(errors_m, blocks, sums, expected_m)
+    )
     freedom = 0.0 if sums is None else len(sums.trials) - 1.0
-    (of_mean, _), (of_p95, together) = (pooled_variance(variance, freedom, of_length) for variance in measured)
-    of_next = 2.0 * of_p95 + spread.between**2
-    factor, of_next_factor = student_factor(together), student_factor(together, NEXT_NORMAL_FACTOR)
-    grown = math.exp(factor * math.sqrt(of_mean)), math.exp(factor * math.sqrt(of_p95))
-    longer = math.exp(of_p95)
-    middle, next_grown = p95_m * math.exp(spread.shift), math.exp(of_next_factor * math.sqrt(of_next))
+    (mean_variance, _), (p95_variance, together) = (
+        pooled_variance(variance, freedom, length_variance) for variance in measured
+    )
+    next_variance = 2.0 * p95_variance + spread.between**2
+    factor, next_factor = student_factor(together), student_factor(together, NEXT_NORMAL_FACTOR)
+    grown = math.exp(factor * math.sqrt(mean_variance)), math.exp(factor * math.sqrt(p95_variance))
+    longer = math.exp(p95_variance)
+    middle, next_grown = p95_m * math.exp(spread.shift), math.exp(next_factor * math.sqrt(next_variance))
     next_low, next_high = middle / next_grown, middle * next_grown
     p95_low, p95_high = max(p95_m / grown[1], min(p50_m, p95_m)), min(p95_m * grown[1] * longer, max(next_high, p95_m))
     return Intervals(expected_m / grown[0], expected_m * grown[0], p95_low, p95_high, next_low, next_high)
@@ -282,8 +286,8 @@ def error_intervals(
 def _block_variances(errors_m: Floats, blocks: Blocks, sums: BlockSums, expected_m: float) -> tuple[float, float]:
     """Return the variances of the logarithms of mean and root mean square that the blocks show."""
     squares, trials = np.add.reduceat(errors_m[blocks.rows] ** 2, blocks.first), sums.trials
-    of_rms = variance_of_sum(np.asarray(squares / squares.sum() - trials / trials.sum()) / 2.0)
-    return variance_of_sum(sums.influence("expected") / expected_m), of_rms
+    rms_variance = variance_of_sum(np.asarray(squares / squares.sum() - trials / trials.sum()) / 2.0)
+    return variance_of_sum(sums.influence("expected") / expected_m), rms_variance
 
 
 def difference_half_width(

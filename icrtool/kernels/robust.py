@@ -271,11 +271,11 @@ def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None =
     expected = None
     if group_std is not None:
         order, first = _grouped(group)
-        of_groups = [
+        group_matrices = [
             normal_equations(fit.residuals[rows], fit.jacobian[rows], fit.weights[rows])[0] * group_std
             for rows in np.split(order, first[1:])
         ]
-        expected = np.sum([matrix @ matrix.T for matrix in of_groups], axis=0)
+        expected = np.sum([matrix @ matrix.T for matrix in group_matrices], axis=0)
     meat = _spread(fit.gradients(group), expected) + fit.prior
     inverse = np.linalg.inv(fit.information)
     sandwich = inverse @ meat @ inverse
@@ -321,12 +321,12 @@ def correlated_covariance(fit: Linearised, group: Ints) -> Floats:
     covariance = sandwich_covariance(fit, group)
     inverse = np.linalg.inv(fit.information)
     series = fit.gradients(group) @ inverse
-    of_prior = np.einsum("ij,j,ij->i", inverse, np.diag(fit.prior), inverse)
+    prior_variance = np.einsum("ij,j,ij->i", inverse, np.diag(fit.prior), inverse)
     square = (series**2).sum(axis=0)
     data = np.diag(covariance)
     is_shown = data > 0.0
     grown = np.ones(len(data))
-    grown[is_shown] = np.maximum(1.0, ((square * long_run_factor(series) + of_prior)[is_shown] / data[is_shown]))
+    grown[is_shown] = np.maximum(1.0, ((square * long_run_factor(series) + prior_variance)[is_shown] / data[is_shown]))
     size = np.sqrt(grown)
     return np.asarray(covariance * np.outer(size, size), np.float64)
 

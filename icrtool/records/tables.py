@@ -138,9 +138,9 @@ class RobotLog:
         DataError
             A column is missing, holds a value that is not a number, or has fewer than two samples; the column is named.
         """
-        samples, of_wheels = _wheels(wheels, name)
-        fixes, datum, of_position = _position(position, name)
-        headings, of_heading = _heading(heading, name)
+        samples, wheel_columns = _wheels(wheels, name)
+        fixes, datum, position_columns = _position(position, name)
+        headings, heading_columns = _heading(heading, name)
         rates = None
         if gyro is not None and any(column in gyro for (column,) in GYRO_COLUMNS):
             column = _chosen(gyro, GYRO_COLUMNS, "gyro", name)
@@ -148,9 +148,9 @@ class RobotLog:
             rates = GyroSamples(column[0], stamps, rate if column == GYRO_COLUMNS[0] else -rate)
         wheel_kind = "position" if samples.from_position else "speed"
         roles: tuple[tuple[Role, str, pd.DataFrame, tuple[str, ...], Ints, str], ...] = (
-            ("wheels", "wheels", wheels, of_wheels, samples.stamp_ns, wheel_kind),
-            ("gnss", "position", position, of_position, fixes.stamp_ns, "metric" if datum is None else "geodetic"),
-            ("heading", "heading", heading, of_heading, headings.stamp_ns, "clockwise from north"),
+            ("wheels", "wheels", wheels, wheel_columns, samples.stamp_ns, wheel_kind),
+            ("gnss", "position", position, position_columns, fixes.stamp_ns, "metric" if datum is None else "geodetic"),
+            ("heading", "heading", heading, heading_columns, headings.stamp_ns, "clockwise from north"),
         )
         streams, notes = [], []
         for role, group, frame, columns, stamps, kind in roles:

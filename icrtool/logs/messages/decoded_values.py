@@ -24,7 +24,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoder import Decoder, text_codes
-from icrtool.logs.messages.definition_bounds import MOST_FIELDS, FieldNames
+from icrtool.logs.messages.definition_bounds import MOST_FIELDS, NameBudget
 from icrtool.logs.messages.definition_text import full_name
 from icrtool.logs.messages.definitions import (
     BASE,
@@ -457,12 +457,12 @@ def definitions_in_schema(text: str, message_type: str) -> Definitions:
     except ValueError as err:
         raise DefinitionError(message_type, "the schema in the log is no JSON") from err
     definitions: dict[str, tuple[Any, Any]] = {}
-    _count_fields(schema, [], FieldNames(message_type))
+    _count_fields(schema, [], NameBudget(message_type))
     _add_definition(definitions, full_name(message_type), schema, 0)
     return definitions
 
 
-def _count_fields(schema: object, within: list[str], names: FieldNames) -> int:
+def _count_fields(schema: object, within: list[str], names: NameBudget) -> int:
     """Return the number of fields of an object, with the fields of the objects in it.
 
     Raises

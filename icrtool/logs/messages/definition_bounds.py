@@ -41,7 +41,7 @@ text."""
 
 
 @dataclass(slots=True)
-class FieldNames:
+class NameBudget:
     """Counter of the characters of all full names of fields of a message type, used before any name is made.
 
     Many fields, each with a long name, would fill the memory although each number is within its own limit.
@@ -73,7 +73,7 @@ class FieldNames:
             return
         raise DefinitionError(self.message_type, why, "this type is not read")
 
-    def add_text(self, text: str) -> None:
+    def check_words(self, text: str) -> None:
         """Refuse a definition with a word that is too long for a name, outside comments and strings.
 
         Raises

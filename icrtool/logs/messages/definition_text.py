@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Any, Literal
 
 from icrtool.errors import DefinitionError
-from icrtool.logs.messages.definition_bounds import COMMENT_OR_STRING, FieldNames
+from icrtool.logs.messages.definition_bounds import COMMENT_OR_STRING, NameBudget
 from icrtool.records.text import LONGEST_NAME, shortened
 
 SEPARATOR = "=" * 80
@@ -104,8 +104,8 @@ def parse_definition(text: str, written: Literal["msg", "idl"], message_type: st
     text = plain_definition(text, message_type)
     if text.count(_SEPARATOR) > MOST_TYPES:
         raise DefinitionError(message_type, too_long, "this type is not read")
-    names = FieldNames(message_type)
-    names.add_text(text)
+    names = NameBudget(message_type)
+    names.check_words(text)
     try:
         if written == "msg":
             return _with_counted_names(get_types_from_msg(text, full_name(message_type)), names)
@@ -126,8 +126,8 @@ def parse_definition(text: str, written: Literal["msg", "idl"], message_type: st
     return _with_counted_names(types, names)
 
 
-def _with_counted_names(types: dict[str, tuple[Any, Any]], names: FieldNames) -> dict[str, tuple[Any, Any]]:
-    """Return parsed types after the full names of their fields were counted; raise as `FieldNames.add`."""
+def _with_counted_names(types: dict[str, tuple[Any, Any]], names: NameBudget) -> dict[str, tuple[Any, Any]]:
+    """Return parsed types after the full names of their fields were counted; raise as `NameBudget.add`."""
     for name, (_, fields) in types.items():
         for named, _ in fields:
             names.add(name, named)

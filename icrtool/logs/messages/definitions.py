@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.definition_bounds import MOST_FIELDS, FieldNames
+from icrtool.logs.messages.definition_bounds import MOST_FIELDS, NameBudget
 from icrtool.logs.messages.definition_text import LONGEST_DEFINITION, full_name, parse_definition, plain_definition
 
 NUMBERS, TEXT, LOOP = range(3)
@@ -272,7 +272,7 @@ def decoding_steps(path: str) -> tuple[Step, ...]:
 class _Compiler:
     """Compiler of one message type: it reads the definition once and writes the program."""
 
-    def __init__(self, definitions: Definitions, names: FieldNames, wanted: Sequence[str], *, cdr: bool) -> None:
+    def __init__(self, definitions: Definitions, names: NameBudget, wanted: Sequence[str], *, cdr: bool) -> None:
         self._definitions, self._names = definitions, names
         self._wanted = frozenset(wanted)
         self.cdr = cdr
@@ -403,7 +403,7 @@ def compile_layout(
         The definition of a type is missing, a field has a type that cannot be passed over, or a limit is exceeded.
     """
     package, _, name = message_type.partition("/")
-    compiler = _Compiler(definitions, FieldNames(message_type), wanted, cdr=encoding == "cdr")
+    compiler = _Compiler(definitions, NameBudget(message_type), wanted, cdr=encoding == "cdr")
     compiler.add_message(f"{package}/msg/{name}", "")
     program = compiler.program
     while program and not program[-1].takes:

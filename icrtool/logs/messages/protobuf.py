@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from icrtool.errors import DefinitionError
-from icrtool.logs.messages.definition_bounds import MOST_FIELDS, FieldNames
+from icrtool.logs.messages.definition_bounds import MOST_FIELDS, NameBudget
 from icrtool.logs.messages.definitions import (
     BASE,
     DEEPEST,
@@ -88,7 +88,7 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
     except (DecodeError, UnicodeDecodeError, RecursionError) as err:
         raise DefinitionError(message_type, "the schema in the log is no FileDescriptorSet") from err
     descriptors: dict[str, list[ProtobufField]] = {}
-    parts, names = 0, FieldNames(message_type)
+    parts, names = 0, NameBudget(message_type)
     for file in files[:MOST_FIELDS]:
         prefix = f"{_name(file.package)}." if file.package else ""
         for name, message in _types_in(file.message_type, prefix, 1, names):
@@ -122,7 +122,7 @@ def _name(text: str | bytes) -> str:
 
 
 def _types_in(
-    messages: Iterable[DescriptorProto], prefix: str, depth: int, names: FieldNames
+    messages: Iterable[DescriptorProto], prefix: str, depth: int, names: NameBudget
 ) -> Iterator[tuple[str, DescriptorProto]]:
     """Yield the message types at a depth, and the message types in them, with their full names.
 

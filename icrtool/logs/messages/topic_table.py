@@ -406,6 +406,6 @@ def _interface_decoder(channel: Channel) -> Decoder:
     types = decoder.types
     if f"{_VALUES}[*]" not in types or any(types.get(path) != "string" for path in (_NAMES, f"{_INTERFACES}[*]")):
         raise DefinitionError(channel.message_type, "its definition in the log lacks names or values of the joints")
-    of_header = {path: primitive for path, primitive in types.items() if path in HEADER}
-    of_joints = {"name[*]": "string", "position[*]": "float64", "velocity[*]": "float64"}
-    return Decoder(decoder.layout, of_header | of_joints, JointColumns)
+    header_types = {path: primitive for path, primitive in types.items() if path in HEADER}
+    joint_types = {"name[*]": "string", "position[*]": "float64", "velocity[*]": "float64"}
+    return Decoder(decoder.layout, header_types | joint_types, JointColumns)

@@ -103,7 +103,7 @@ def test_the_path_of_a_reversed_side_fits_as_well() -> None:
     named, other = (wheel_path(track_of_log(one)) for one in (log, reversed_))
     assert named is not None
     assert other is not None
-    np.testing.assert_allclose(np.abs(np.diff(other.place)), np.abs(np.diff(named.place)), rtol=1e-9)
+    np.testing.assert_allclose(np.abs(np.diff(other.position)), np.abs(np.diff(named.position)), rtol=1e-9)
 
 
 def test_the_filter_starts_as_far_from_its_last_fix_as_the_robot_has_driven() -> None:
