@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import math
 import os
 import signal
 import sys
@@ -82,6 +83,8 @@ def _run() -> int:
 
             register_completion()
         try:
+            if len(sys.argv) > 2 and _address_limit_bytes() < LEAST_ADDRESS_BYTES:
+                raise MemoryError
             status = icrtool.main(standalone_mode=False)
         except (IcrToolError, OSError) as err:
             if isinstance(err, OSError) and err.filename is None:
@@ -92,9 +95,8 @@ def _run() -> int:
             # For example a path that is too long, or a disk that fails, of which no command reports more.
             print_error(f"{LogText(str(err.filename))}: {err.strerror}" if isinstance(err, OSError) else str(err))
             return 1
-        except (MemoryError, ImportError, SystemError) as err:
-            # After a lack of memory, a library or a module may be loaded only in part.
-            if not (isinstance(err, MemoryError) or _memory_is_limited()):
+        except (MemoryError, ImportError, RuntimeError, SystemError) as err:
+            if not _shows_lack_of_memory(err):
                 raise
             advice = "give it more (ulimit -v), or read a part of the log (--from, --to)"
             sys.stderr.write(f"Error: memory: the process has reached its limit; {advice}\n")
@@ -113,13 +115,30 @@ def _run() -> int:
     return status if isinstance(status, int) else 0
 
 
-def _memory_is_limited() -> bool:
-    """Return whether the address space of the process has a limit (``ulimit -v``)."""
+NO_THREAD = "can't start new thread"
+"""Text of the RuntimeError that Python raises if there is no memory for the stack of a thread."""
+
+LEAST_ADDRESS_BYTES = 420_000_000
+"""Smallest address space in which NumPy, pandas and pyarrow are loaded [bytes]. In less, OpenBLAS ends the process, and
+no error can be caught."""
+
+
+def _shows_lack_of_memory(err: Exception) -> bool:
+    """Return whether an error shows that the process has reached its limit of memory."""
+    if isinstance(err, MemoryError):
+        return True
+    # After a lack of memory, a library or a module may be loaded only in part.
+    return (str(err) == NO_THREAD or not isinstance(err, RuntimeError)) and math.isfinite(_address_limit_bytes())
+
+
+def _address_limit_bytes() -> float:
+    """Return the limit of the address space of the process (``ulimit -v``) [bytes]; infinite without a limit."""
     with suppress(ImportError):
         import resource
 
-        return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
-    return False
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        return math.inf if limit == resource.RLIM_INFINITY else limit
+    return math.inf
 
 
 class _LazyFinder:

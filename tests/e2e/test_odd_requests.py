@@ -77,7 +77,7 @@ def test_standard_input_that_was_closed_is_one_line() -> None:
     assert "standard input is closed" in error_of(done.stderr)
 
 
-@pytest.mark.parametrize("kilobytes", [180_000, 250_000, 320_000, 400_000])
+@pytest.mark.parametrize("kilobytes", [180_000, 320_000, 345_000, 415_000, 440_000])
 def test_too_little_memory_is_one_line(kilobytes: int) -> None:
     command = ["sh", "-c", f'ulimit -v {kilobytes}; exec "$@"', "sh", *COMMAND, "info", str(MOWER), *ROBOT, "-q"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
