@@ -172,8 +172,10 @@ def measure_gaps(table: States, in_gap: Bools, sensors: SensorData, used: Bools)
 
     Parameters
     ----------
-    table, in_gap : states (n,), and which of them begin a gap
-    sensors : of the run; used : (m,) fixes that the filter used
+    table : states (n,)
+    in_gap : (n,) states that begin a gap
+    sensors : sensor data of the run, with m fixes
+    used : (m,) fixes that the filter used
     """
     rows, seen = np.flatnonzero(in_gap), sensors.fixes.cut(used)
     if not (len(rows) and len(seen.stamp_ns)):

@@ -20,7 +20,14 @@ from icrtool.estimation.observability import (
     multiplier_std,
     unlearned_icrs,
 )
-from icrtool.estimation.odometry import OdometryName, drive_summary, drive_wheels, measure_gaps, odometry_icrs
+from icrtool.estimation.odometry import (
+    GapPaths,
+    OdometryName,
+    drive_summary,
+    drive_wheels,
+    measure_gaps,
+    odometry_icrs,
+)
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import (
     antenna_warning,
@@ -99,13 +106,7 @@ def summarise(
         rejected, inverted=inverted,
     )  # fmt: skip
     gaps = measure_gaps(table, filtered.in_gap, sensors, filtered.gnss.used)
-    if gaps.unseen_m > 0.0:
-        why = (
-            f"the driven distance is a lower limit: for {gaps.unseen_s:.1f} s the log has neither wheel samples nor "
-            f"positions, and the {gaps.unseen_m:.1f} m between their ends are counted"
-        )
-        notes = (*notes, note("distance_is_lower_limit", why, sensors.name))
-    notes = (*notes, *notes_about(sensors.name, unusable))
+    notes = (*notes, *_notes_of_gaps(gaps, sensors.name), *notes_about(sensors.name, unusable))
     hidden = () if config.filter.rules.final_of_filter else excitation.verdict.not_shown
     return RunDocument(
         schema=RUN_SCHEMA,
@@ -137,6 +138,17 @@ def summarise(
         filter=filter_summary(measurements, filtered, config),
         excitation=excitation,
     )  # fmt: skip
+
+
+def _notes_of_gaps(gaps: GapPaths, log: str) -> tuple[Note, ...]:
+    """Return the note about gaps in which neither wheels nor positions show the driven distance."""
+    if gaps.unseen_m <= 0.0:
+        return ()
+    why = (
+        f"the driven distance is a lower limit: for {gaps.unseen_s:.1f} s the log has neither wheel samples nor "
+        f"positions, and the {gaps.unseen_m:.1f} m between their ends are counted"
+    )
+    return (note("distance_is_lower_limit", why, log),)
 
 
 def _rejected_shares(filtered: Filtered) -> dict[str, float]:
