@@ -194,7 +194,7 @@ def blocks_of_numbers(
     multiplier = plus_minus(numbers.multiplier, numbers.multiplier_std, sign="")
     rows = [
         ("wheel_separation_multiplier", f"{multiplier}, next drive ± {numbers.multiplier_next_std:.2g}"),
-        ("left, right wheel radius", f"{radii} ± {std:.3f} times the configured radius"),
+        ("left, right wheel radius", f"{radii} ± {std:.3f} × configured"),
     ]
     without = f"(right - left) / {width_m:g} m is the multiplier; without slip: ±{width_m / 2:.3g} m"
     return [Facts(rows, "controller"), Facts([_icr_row(icrs), ("", without)])]
