@@ -22,7 +22,8 @@ from icrtool.records.samples import Datum, HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog
 
 WITNESS_SIGMAS = 5.0
-"""Turn of the heading by the wheels, in its standard deviations, from which on both turn in one sense."""
+"""Smallest ratio of the heading's turn to the wheels' turn, in its standard deviations. A smaller ratio does not show
+that both turn in one sense."""
 
 LEAST_GYRO_TURN_RAD = math.pi / 2
 """Smallest range of the heading by a gyro alone [rad]. The drift of a gyro that turns less may look like a turn."""
@@ -125,7 +126,9 @@ def _exchanged_by_distance(log: RobotLog, named: RobotLog) -> RobotLog:
 
 
 def _with_turned_heading(log: RobotLog) -> RobotLog:
-    """Return the log with the integral of its gyro (z up) as heading, from any start; without a heading if none turns.
+    """Return the log with the integral of its gyro (z up) as heading; without a heading if no gyro turns enough.
+
+    The heading starts at any angle.
 
     The bias of the gyro is its rate where the wheels do not turn, by regression on their turn.
     """

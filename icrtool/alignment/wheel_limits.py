@@ -41,8 +41,8 @@ def find_clock_rate(fit: AlignmentFit) -> ClockRate | None:
     Notes
     -----
     In each part of the drive, the delay is the one with the smallest sum of squares of the heading's turn minus a share
-    of the wheels' turn. The standard deviation of the line through the delays is from their scatter, at least from the
-    sums of squares.
+    of the wheels' turn. The rate is the slope of a line through the delays. Its standard deviation follows from the
+    scatter of the delays around the line, and is never smaller than the standard deviations of the delays imply.
     """
     track, middle_s = fit.windows.track, fit.estimate("heading_delay")[0]
     if track.measured_t is not None:
@@ -139,7 +139,8 @@ LEAST_LIMIT_SHARE, LEAST_LIMIT_RUN = 0.01, 5
 """Smallest share of the samples at a limit, and smallest number of equal samples in succession."""
 
 LIMIT_CHANCE = 1e-6
-"""Largest probability that values which repeat as often as elsewhere have the longest run of the largest speed."""
+"""Significance level of a limit. The longest run of the largest speed shows a limit if a run of this length is less
+probable, given how often other speeds repeat."""
 
 AT_LIMIT_SHARE = 0.2
 """Smallest share of the time of a window with which the window counts as at the limit. Where most windows have more,

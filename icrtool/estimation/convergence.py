@@ -21,7 +21,8 @@ LEARNED_SHARE = 0.9
 """Share of the decrease of its standard deviation after which an ICR is learned."""
 
 LEAST_FALL = 0.5
-"""Smallest relative decrease of a standard deviation. With a smaller decrease, the drive added nothing to the start."""
+"""Smallest relative decrease of a standard deviation. An ICR whose
+standard deviation decreases less is not learned."""
 
 
 def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:

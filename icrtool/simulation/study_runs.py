@@ -321,9 +321,9 @@ def convergence_time(t: Floats, value: Floats, target: float) -> float:
 
     Notes
     -----
-    Pentzer 2014, Section 5.2. `icrtool.estimation.summary.converge` computes another time, of a run without a known
-    truth: its target is the median of the run's second half, and from its end on the estimate must stay within 10 %
-    of the change for some seconds. `settling_time` is the time to stay near the truth.
+    Pentzer 2014, Section 5.2. `icrtool.estimation.convergence.converge` is for runs whose truth is not known: its
+    target is the median of the run's second half, and at the time that it returns, the estimate has come within 10 % of
+    the change and stays there for some seconds. `settling_time` is the time to stay near the truth.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         share = (value - value[0]) / (target - value[0])

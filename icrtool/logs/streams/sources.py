@@ -385,13 +385,13 @@ def make_wheel_source(
     for row, (left, right) in enumerate((position, speed)):
         if left is not None and right is not None and np.isfinite(left).any() and np.isfinite(right).any():
             pairs[row] = left, right
-    travelled, speeds = pairs
-    changes = any(float(np.ptp(side[np.isfinite(side)])) > 0.0 for side in travelled or ())
-    if travelled is None and speeds is None and twist is None:
+    positions, speeds = pairs
+    changes = any(float(np.ptp(side[np.isfinite(side)])) > 0.0 for side in positions or ())
+    if positions is None and speeds is None and twist is None:
         problem = problem or "has neither position nor speed of both sides"
     elif not changes and not any(wheels_move(values) for values in (*(speeds or ()), twist) if values is not None):
         score, why = score - NEVER_MOVES_PENALTY, f"{why}, never moves"
-    return WheelSource(position=travelled, speed=speeds, twist=twist, score=score, why=why, problem=problem, **others)
+    return WheelSource(position=positions, speed=speeds, twist=twist, score=score, why=why, problem=problem, **others)
 
 
 def wheels_move(speeds: Floats) -> bool:
