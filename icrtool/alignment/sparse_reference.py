@@ -95,8 +95,8 @@ class WheelPath(NamedTuple):
 
     Attributes
     ----------
-    position : (m,) by the wheels, in their unit, with an unknown direction
-    noise_m : of the fixes on one axis [m], beyond the path and slip
+    position : (m,) positions by the wheels at the fixes, in the unit of the wheels, with an unknown direction
+    noise_m : standard deviation of the fixes on one axis [m], without the part that path and slip explain
     misfit : median distance of a fix from the place that the two fixes before it and the path give, over the step
     """
 
@@ -161,7 +161,9 @@ def _third_fixes(path: Complexes, position: Complexes, usable: Bools) -> tuple[C
 
     Parameters
     ----------
-    path, position : (m,) by the wheels and by the fixes; usable : (m - 2,) triples that are returned
+    path : (m,) positions by the wheels
+    position : (m,) positions by the fixes [m]
+    usable : (m - 2,) triples that are returned
     """
     first, second = np.diff(path)[:-1][usable], np.diff(path)[1:][usable]
     gain = second / np.where(np.abs(first) > 0.0, first, np.inf)

@@ -17,11 +17,11 @@ RATE_BLOCKS, FEWEST_RATE_BLOCKS, RATE_WINDOW_S = 10, 6, 2.0
 compared [s]."""
 
 FURTHEST_DELAY_S, RATE_DELAY_STEP_S = 3.0, 0.05
-"""Largest difference of the delay of a part from that of the whole drive, and step between compared delays [s]."""
+"""Largest difference of the delay of a part from the delay of the whole drive, and step between compared delays [s]."""
 
 
 class ClockRate(NamedTuple):
-    """Rate of the wheels' clock against that of the headings, minus 1, and its standard deviation."""
+    """Rate of the wheels' clock against the headings' clock, minus 1, and its standard deviation."""
 
     value: float
     std: float
@@ -31,12 +31,13 @@ class ClockRate(NamedTuple):
         rate = f"{100 * abs(self.value):.2f} ± {100 * self.std:.2f} % {'faster' if self.value > 0.0 else 'slower'}"
         apart = f"they part by {abs(self.value) * duration_s:.1f} s in this drive"
         return (
-            f"the clock of the wheels goes {rate} than that of the headings: {apart}; topics.clock=log takes log times"
+            f"the clock of the wheels goes {rate} than the clock of the headings: {apart}; "
+            "topics.clock=log takes log times"
         )
 
 
 def find_clock_rate(fit: AlignmentFit) -> ClockRate | None:
-    """Return the rate of the wheels' clock if it is shown to differ from that of the headings; else None.
+    """Return the rate of the wheels' clock if it is shown to differ from the headings' clock; else None.
 
     Notes
     -----
@@ -131,7 +132,7 @@ class SpeedLimit(NamedTuple):
         often = f"in {100 * self.share:.0f} % of the samples"
         return (
             f"the wheels report their largest speed {often} while the robot goes faster, by {self.sigmas:.0f} σ: "
-            f"the ICRs are those of speeds that were cut off"
+            f"the ICRs are learned from speeds that were cut off"
         )
 
 

@@ -130,11 +130,16 @@ for stored in (whole, *(hashlib.sha256(one).digest() + one for one in map(bytes.
 """
 
 
-def test_malformed_machine_code_with_the_right_digest_is_not_run(place: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", CALL_MALFORMED, str(place)], env={**os.environ, "NUMBA_CACHE_DIR": str(place)},
-        input="".join(f"{one.hex()}\n" for one in MALFORMED), capture_output=True, text=True, check=False,
+def run_script(script: str, place: Path, text: str = "") -> subprocess.CompletedProcess[str]:
+    """Run a script with the folder of compiled kernels as its argument and cache, and a text as standard input."""
+    return subprocess.run(
+        [sys.executable, "-c", script, str(place)], env={**os.environ, "NUMBA_CACHE_DIR": str(place)},
+        input=text, capture_output=True, text=True, check=False,
     )  # fmt: skip
+
+
+def test_malformed_machine_code_with_the_right_digest_is_not_run(place: Path) -> None:
+    done = run_script(CALL_MALFORMED, place, "".join(f"{code.hex()}\n" for code in MALFORMED))
     assert done.stdout.splitlines() == ["1.5 0"] + ["1.5 1"] * len(MALFORMED), done.stderr
     assert done.returncode == 0
 
@@ -158,10 +163,7 @@ for of_file, of_place in ((0o644, 0o700), (0o777, 0o700), (0o644, 0o777), (0o644
 
 def test_machine_code_that_everybody_may_write_is_not_run(place: Path) -> None:
     """Neither a file nor a folder that is open to all; as soon as both are the owner's again, it is."""
-    done = subprocess.run(
-        [sys.executable, "-c", CALL_OPEN_TO_ALL, str(place)], env={**os.environ, "NUMBA_CACHE_DIR": str(place)},
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = run_script(CALL_OPEN_TO_ALL, place)
     assert done.stdout.splitlines() == ["1.5 0", "1.5 1", "1.5 1", "1.5 0"], done.stderr
     assert done.returncode == 0
 
